@@ -1,0 +1,213 @@
+"""Cameras as arrays: lens models, poses, pixels to rays, candidate poses.
+
+Poses use the OpenGL axes (x right, y up, the camera looks along -z) and pixel centres lie at
+integer + 0.5, so that the ray through the middle of a W x H image is pixel (W / 2, H / 2).
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+NEWTON_STEPS = 8
+
+
+@struct.dataclass
+class Rays:
+    """Half lines in world space; `directions` are unit vectors, so `t` is a distance."""
+
+    origins: jax.Array  # [..., 3] scene units
+    directions: jax.Array  # [..., 3] unit
+
+
+@struct.dataclass
+class Cameras:
+    """V posed cameras with one lens model; images may differ in size."""
+
+    world_from_cam: jax.Array  # [V, 3, 4] OpenGL axes, scene units
+    intrinsics: jax.Array  # [V, 4] fx, fy, cx, cy in pixels
+    distortion: jax.Array  # [V, 6] k1, k2, k3, k4, p1, p2
+    sizes: jax.Array  # [V, 2] int32 width, height in pixels
+    lens: str = struct.field(pytree_node=False, default="pinhole")
+
+    @property
+    def positions(self) -> jax.Array:
+        """Camera centres [V, 3], scene units."""
+        return self.world_from_cam[..., :, 3]
+
+    def __len__(self) -> int:
+        return self.world_from_cam.shape[0]
+
+
+# --- lens models -----------------------------------------------------------------------------
+# A lens maps a point of the undistorted plane z = -1 to where it is seen, both [2].
+
+
+def distort_pinhole(xy: jax.Array, distortion: jax.Array) -> jax.Array:
+    """The ideal lens: points are seen where they are."""
+    del distortion
+    return xy
+
+
+def distort_opencv(xy: jax.Array, distortion: jax.Array) -> jax.Array:
+    """Brown-Conrady: radial `1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8` and tangential `p1, p2`.
+
+    Differs from OpenCV: `k4` is the `r^8` term, as in nerfstudio, not a denominator.
+    """
+    k1, k2, k3, k4, p1, p2 = (distortion[..., i] for i in range(6))
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    yd = y * radial + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y)
+    return jnp.stack([xd, yd], axis=-1)
+
+
+LENSES = {"pinhole": distort_pinhole, "opencv": distort_opencv}
+
+
+def undistort(xy_distorted: jax.Array, distortion: jax.Array, *, lens: str) -> jax.Array:
+    """Inverts a lens by Newton's method with its exact derivative.
+
+    Solves `distort(xy) = xy_distorted` from the start `xy = xy_distorted`.
+
+    Args:
+      xy_distorted: [2] point on the plane z = -1 as seen through the lens.
+      distortion: [6] coefficients.
+      lens: a key of `LENSES`.
+
+    Returns:
+      [2] undistorted point. Use `jax.vmap` for many.
+
+    Numerics: a fixed number of steps, each by Cramer's rule; the determinant is kept away from 0
+    so that a pixel outside of the lens's invertible range stays finite.
+    """
+    if lens == "pinhole":
+        return xy_distorted
+    distort = LENSES[lens]
+
+    def step(xy, _):
+        error = distort(xy, distortion) - xy_distorted
+        jac = jax.jacfwd(distort)(xy, distortion)
+        det = jac[0, 0] * jac[1, 1] - jac[0, 1] * jac[1, 0]
+        det = jnp.where(jnp.abs(det) < 1e-6, 1e-6, det)
+        dx = (jac[1, 1] * error[0] - jac[0, 1] * error[1]) / det
+        dy = (jac[0, 0] * error[1] - jac[1, 0] * error[0]) / det
+        return xy - jnp.stack([dx, dy]), None
+
+    xy, _ = jax.lax.scan(step, xy_distorted, None, length=NEWTON_STEPS)
+    return xy
+
+
+# --- pixels to rays --------------------------------------------------------------------------
+
+
+def pixel_rays(cameras: Cameras, view_ids: jax.Array, pixels: jax.Array) -> Rays:
+    """Rays through given pixels: `origin = t`, `direction = R [x, -y, -1] / |.|`.
+
+    Args:
+      cameras: V cameras.
+      view_ids: [R] int, which camera each ray belongs to.
+      pixels: [R, 2] x (to the right) and y (down) in pixels; the first pixel's centre is 0.5.
+
+    Returns:
+      `Rays` of shape [R, 3].
+    """
+    fx, fy, cx, cy = (cameras.intrinsics[view_ids, i] for i in range(4))
+    xy = jnp.stack([(pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy], axis=-1)
+    if cameras.lens != "pinhole":
+        xy = jax.vmap(lambda p, d: undistort(p, d, lens=cameras.lens))(
+            xy, cameras.distortion[view_ids]
+        )
+    local = jnp.stack([xy[..., 0], -xy[..., 1], -jnp.ones_like(xy[..., 0])], axis=-1)
+    pose = cameras.world_from_cam[view_ids]
+    # Spelt out rather than a matrix product: exact float32 on every accelerator.
+    world = (pose[..., :3, :3] * local[..., None, :]).sum(-1)
+    directions = world / jnp.linalg.norm(world, axis=-1, keepdims=True)
+    return Rays(origins=pose[..., :3, 3], directions=directions)
+
+
+def image_pixels(width: int, height: int) -> np.ndarray:
+    """Pixel centres of a whole image in row order, [H * W, 2] float32 (x, y)."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
+
+
+# --- host-side helpers -----------------------------------------------------------------------
+
+
+def make_cameras(world_from_cam, intrinsics, sizes, *, distortion=None, lens="pinhole") -> Cameras:
+    """Builds `Cameras` from array-likes; `distortion` defaults to none."""
+    world_from_cam = np.asarray(world_from_cam, np.float32)[..., :3, :4]
+    num = world_from_cam.shape[0]
+    if distortion is None:
+        distortion = np.zeros((num, 6), np.float32)
+    return Cameras(
+        world_from_cam=world_from_cam,
+        intrinsics=np.asarray(intrinsics, np.float32),
+        distortion=np.asarray(distortion, np.float32),
+        sizes=np.asarray(sizes, np.int32),
+        lens=lens,
+    )
+
+
+def take(cameras: Cameras, view_ids) -> Cameras:
+    """The cameras at `view_ids`, in that order."""
+    return jax.tree.map(lambda x: x[view_ids], cameras)
+
+
+def rescale(cameras: Cameras, sizes) -> Cameras:
+    """The same cameras with images of other sizes [V, 2]; intrinsics scale along."""
+    sizes = np.asarray(sizes, np.int32)
+    factor = sizes / np.asarray(cameras.sizes)  # [V, 2]
+    scale = np.concatenate([factor, factor], axis=-1).astype(np.float32)
+    return cameras.replace(intrinsics=cameras.intrinsics * scale, sizes=sizes)
+
+
+def look_at(position, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
+    """Pose [3, 4] of a camera at `position` that looks at `target`, OpenGL axes.
+
+    Where the view line is parallel to `up`, the world's x axis takes the place of `up`.
+    """
+    position, target, up = (np.asarray(v, np.float64) for v in (position, target, up))
+    back = position - target
+    back = back / np.linalg.norm(back)
+    right = np.cross(up, back)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross([1.0, 0.0, 0.0], back)
+    right = right / np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back, position], axis=-1)
+
+
+def hemisphere_poses(key, num: int, *, centre, radius: float, up=(0.0, 0.0, 1.0)) -> np.ndarray:
+    """Candidate poses uniform in area on the upper hemisphere, looking at its centre (Eq 14).
+
+    `phi = 2 pi u`, `theta = arccos(1 - v)` with `u, v ~ U[0, 1]`, `theta` measured from `up`.
+
+    Args:
+      key: random key.
+      num: how many.
+      centre: [3] scene centre, scene units.
+      radius: camera distance, scene units.
+      up: [3] the hemisphere's pole.
+
+    Returns:
+      [num, 3, 4] poses, float32.
+    """
+    u, v = np.asarray(jax.random.uniform(key, (2, num)), np.float64)
+    phi, cos_theta = 2.0 * np.pi * u, 1.0 - v
+    sin_theta = np.sqrt(np.maximum(1.0 - cos_theta**2, 0.0))
+    up = np.asarray(up, np.float64) / np.linalg.norm(up)
+    east = np.cross(up, [0.0, 1.0, 0.0] if abs(up[1]) < 0.9 else [1.0, 0.0, 0.0])
+    east = east / np.linalg.norm(east)
+    north = np.cross(up, east)
+    offsets = (
+        np.outer(sin_theta * np.cos(phi), east)
+        + np.outer(sin_theta * np.sin(phi), north)
+        + np.outer(cos_theta, up)
+    )
+    centre = np.asarray(centre, np.float64)
+    poses = [look_at(centre + radius * o, centre, up) for o in offsets]
+    return np.stack(poses).astype(np.float32)

@@ -1,0 +1,90 @@
+"""The deformation field `D_theta`: offsets on the vertices of a grid, trilinear in between.
+
+The grid is addressed in coordinates normalised to the scene box; its offsets are added to
+positions in world space. `theta = 0` is the mode of the posterior.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+# The eight corners of a cell, [8, 3], z fastest.
+CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
+
+
+@struct.dataclass
+class DeformationGrid:
+    """`(2^L + 1)^3` vertices over the scene box."""
+
+    box: jax.Array  # [2, 3] scene units
+    log2_cells: int = struct.field(pytree_node=False)  # L
+
+    @property
+    def cells(self) -> int:
+        """Cells per side, `2^L`."""
+        return 2**self.log2_cells
+
+    @property
+    def num_vertices(self) -> int:
+        """G, `(2^L + 1)^3`: one more vertex than cells per side, so upper faces do not wrap."""
+        return (self.cells + 1) ** 3
+
+
+def grid_coordinates(grid: DeformationGrid, positions: jax.Array) -> jax.Array:
+    """Positions [..., 3] in cells, `[0, 2^L]`; points outside of the box get the nearest face."""
+    lower, upper = grid.box
+    unit = jnp.clip((positions - lower) / (upper - lower), 0.0, 1.0)
+    return unit * grid.cells
+
+
+def vertex_number(grid: DeformationGrid, vertex: jax.Array) -> jax.Array:
+    """Row of integer vertices [..., 3] in arrays over the grid, z fastest."""
+    side = grid.cells + 1
+    return (vertex[..., 0] * side + vertex[..., 1]) * side + vertex[..., 2]
+
+
+def surrounding_vertices(grid: DeformationGrid, positions: jax.Array) -> jax.Array:
+    """The eight vertices of the cell around each position, integer coordinates [..., 8, 3]."""
+    base = jnp.floor(grid_coordinates(grid, positions)).astype(jnp.int32)
+    return jnp.minimum(base, grid.cells - 1)[..., None, :] + CORNERS
+
+
+def trilinear_weights(grid: DeformationGrid, positions: jax.Array, vertices: jax.Array):
+    """Weight of any vertices at any positions: `b = prod_d max(0, 1 - |u_d - v_d|)`.
+
+    Args:
+      grid: the grid.
+      positions: [..., 3] scene units.
+      vertices: [..., 3] integer coordinates, broadcast against `positions`.
+
+    Returns:
+      [...] in [0, 1]; 0 for vertices that are not corners of the position's cell.
+    """
+    distance = jnp.abs(grid_coordinates(grid, positions) - vertices)
+    return jnp.maximum(0.0, 1.0 - distance).prod(-1)
+
+
+def trilinear(grid: DeformationGrid, positions: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Rows [..., 8] of the vertices around each position and their weights `b` [..., 8]."""
+    vertices = surrounding_vertices(grid, positions)
+    return vertex_number(grid, vertices), trilinear_weights(
+        grid, positions[..., None, :], vertices
+    )
+
+
+def displace(grid: DeformationGrid, offsets: jax.Array, positions: jax.Array) -> jax.Array:
+    """The offset at each position, `D_theta(x) = sum_k b_k theta_k`, scene units.
+
+    Args:
+      grid: the grid.
+      offsets: theta [G, 3], scene units.
+      positions: [..., 3].
+
+    Returns:
+      [..., 3].
+    """
+    rows, b = trilinear(grid, positions)
+    return (b[..., None] * offsets[rows]).sum(-2)

@@ -1,0 +1,123 @@
+"""Encodings of positions and directions that let a small network fit fine detail."""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+# The hash primes of Mueller et al. 2022 (Eq 4); the first factor is 1 for cache coherence.
+_PRIME_Y = np.uint32(2654435761)
+_PRIME_Z = np.uint32(805459861)
+
+
+def level_resolutions(num_levels: int, coarsest: int, finest: int) -> tuple[int, ...]:
+    """Cells per side of each level, growing geometrically from `coarsest` to `finest`."""
+    if num_levels == 1:
+        return (finest,)
+    growth = (finest / coarsest) ** (1.0 / (num_levels - 1))
+    return tuple(round(coarsest * growth**level) for level in range(num_levels))
+
+
+def _vertex_row(x, y, z, *, resolution: int, table_size: int):
+    """Row of vertex (x, y, z): dense numbering where it fits the table, hashed elsewhere."""
+    side = resolution + 1
+    if side**3 <= table_size:
+        return (x * side + y) * side + z
+    return (x ^ (y * _PRIME_Y) ^ (z * _PRIME_Z)) & np.uint32(table_size - 1)
+
+
+def interpolate_level(table: jax.Array, unit_positions: jax.Array, resolution: int) -> jax.Array:
+    """Trilinear interpolation of one level: `sum_k b_k table[row(vertex_k)]`.
+
+    Args:
+      table: [T, F] features; T is `(resolution + 1)^3` (dense) or a power of two (hashed).
+      unit_positions: [K, 3] in [0, 1].
+      resolution: cells per side.
+
+    Returns:
+      [K, F] features.
+    """
+    table_size = table.shape[0]
+    scaled = unit_positions * resolution
+    # The last cell owns its upper face, so that 1.0 does not read a vertex outside of the grid.
+    base = jnp.clip(jnp.floor(scaled), 0, resolution - 1)
+    frac = scaled - base
+    ix, iy, iz = (base[:, d].astype(jnp.uint32) for d in range(3))
+    features = 0.0
+    # Unrolled: one gather per corner is several times faster than one [K, 8] gather.
+    for corner in range(8):
+        dx, dy, dz = (corner >> 2) & 1, (corner >> 1) & 1, corner & 1
+        row = _vertex_row(
+            ix + dx, iy + dy, iz + dz, resolution=resolution, table_size=table_size
+        )
+        weight = (
+            (frac[:, 0] if dx else 1.0 - frac[:, 0])
+            * (frac[:, 1] if dy else 1.0 - frac[:, 1])
+            * (frac[:, 2] if dz else 1.0 - frac[:, 2])
+        )
+        # Rows are in range by construction, which spares the gather its bounds check.
+        features += weight[:, None] * table.at[row].get(mode="promise_in_bounds")
+    return features
+
+
+class HashEncoding(nn.Module):
+    """Multi-resolution hash grid (Mueller et al. 2022): features of all levels side by side.
+
+    Attributes:
+      resolutions: cells per side of each level.
+      features: features per vertex.
+      log2_table_size: largest table of a level; coarser levels are stored densely.
+    """
+
+    resolutions: tuple[int, ...]
+    features: int = 2
+    log2_table_size: int = 16
+
+    @nn.compact
+    def __call__(self, unit_positions: jax.Array) -> jax.Array:
+        levels = []
+        for level, resolution in enumerate(self.resolutions):
+            rows = min((resolution + 1) ** 3, 2**self.log2_table_size)
+            table = self.param(
+                f"level_{level}",
+                lambda key, shape: jax.random.uniform(key, shape, minval=-1e-4, maxval=1e-4),
+                (rows, self.features),
+            )
+            levels.append(interpolate_level(table, unit_positions, resolution))
+        return jnp.concatenate(levels, axis=-1)
+
+
+def spherical_harmonics(directions: jax.Array, degree: int) -> jax.Array:
+    """Real spherical harmonics of unit directions up to `degree` - 1, [K, degree^2].
+
+    Raises:
+      ValueError: if `degree` is not 1, 2, 3 or 4.
+    """
+    if degree not in (1, 2, 3, 4):
+        raise ValueError(f"spherical_harmonics: degree must be 1, 2, 3 or 4, got {degree}")
+    x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
+    basis = [jnp.full_like(x, 0.28209479177387814)]
+    if degree > 1:
+        c = 0.4886025119029199
+        basis += [-c * y, c * z, -c * x]
+    if degree > 2:
+        basis += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (3.0 * z * z - 1.0),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (x * x - y * y),
+        ]
+    if degree > 3:
+        basis += [
+            -0.5900435899266435 * y * (3.0 * x * x - y * y),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (5.0 * z * z - 1.0),
+            0.3731763325901154 * z * (5.0 * z * z - 3.0),
+            -0.4570457994644658 * x * (5.0 * z * z - 1.0),
+            1.445305721320277 * z * (x * x - y * y),
+            -0.5900435899266435 * x * (x * x - 3.0 * y * y),
+        ]
+    return jnp.stack(basis, axis=-1)

@@ -1,0 +1,37 @@
+"""Functions with a singular point, each with its value *and* gradient stated there."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+MAX_LOG_DENSITY = 12.0
+
+
+@jax.custom_jvp
+def density_from_raw(raw: jax.Array) -> jax.Array:
+    """Density `exp(raw)`, 1 / scene unit, from an unbounded network output.
+
+    Numerics: `raw` is clipped to at most 12 (a density of 1.6e5, opaque in any cell), so the value
+    stays finite; the derivative is that of the clipped value, kept also above the clip, so that a
+    saturated density can still come down.
+    """
+    return jnp.exp(jnp.minimum(raw, MAX_LOG_DENSITY))
+
+
+@density_from_raw.defjvp
+def _density_from_raw_jvp(primals, tangents):
+    density = density_from_raw(primals[0])
+    return density, density * tangents[0]
+
+
+def safe_divide(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
+    """`numerator / denominator`, and 0 with gradient 0 where the denominator is 0."""
+    is_zero = denominator == 0
+    return jnp.where(is_zero, 0.0, numerator / jnp.where(is_zero, 1.0, denominator))
+
+
+def safe_reciprocal(x: jax.Array) -> jax.Array:
+    """`1 / x` for ray-box tests: a zero component becomes 1e-12 and keeps its sign."""
+    tiny = jnp.where(jnp.signbit(x), -1e-12, 1e-12)
+    return 1.0 / jnp.where(jnp.abs(x) < 1e-12, tiny, x)

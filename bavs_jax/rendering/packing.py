@@ -1,0 +1,79 @@
+"""Evaluates a function at the valid samples only, in a buffer of fixed size.
+
+Most slots of [R, S] are empty. Valid samples are numbered row by row and evaluated in a packed
+buffer of K places; the outputs are read back into [R, S], where all compositing happens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+
+def row_starts(sample_mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Number of each row's first sample in packed order, and its number of samples; both [R]."""
+    count = sample_mask.sum(-1, dtype=jnp.int32)
+    return jnp.cumsum(count) - count, count
+
+
+def _packed_slots(starts, count, first, capacity):
+    """Row, slot and validity of the packed places first .. first + capacity."""
+    number = first + jnp.arange(capacity)
+    row = jnp.searchsorted(starts + count, number, side="right")
+    row = jnp.minimum(row, starts.shape[0] - 1)
+    valid = number < starts[-1] + count[-1]
+    return row, jnp.where(valid, number - starts[row], 0), valid
+
+
+def _read_back(packed, starts, first, sample_mask):
+    """Packed outputs [K, ...] as [R, S, ...], 0 in empty slots and those of other passes."""
+    capacity = packed.shape[0]
+    number = starts[:, None] + jnp.arange(sample_mask.shape[1]) - first
+    here = sample_mask & (number >= 0) & (number < capacity)
+    table = packed.at[jnp.clip(number, 0, capacity - 1)].get(mode="promise_in_bounds")
+    return jnp.where(here.reshape(here.shape + (1,) * (packed.ndim - 1)), table, 0)
+
+
+def evaluate_one_pass(fn: Callable, sample_mask: jax.Array, *, capacity: int):
+    """Differentiable: as many whole rays as fit into one buffer.
+
+    Args:
+      fn: (row [K], slot [K], valid [K]) -> pytree of [K, ...]; `row`, `slot` say which sample.
+      sample_mask: [R, S] bool, the valid ones of a row first.
+      capacity: K.
+
+    Returns:
+      outputs as [R, S, ...] and `ray_mask` [R]: false for rays that did not fit; the caller must
+      leave those out whole, they are never cut.
+    """
+    starts, count = row_starts(sample_mask)
+    ray_mask = starts + count <= capacity
+    packed = fn(*_packed_slots(starts, count, 0, capacity))
+    kept = sample_mask & ray_mask[:, None]
+    return jax.tree.map(lambda x: _read_back(x, starts, 0, kept), packed), ray_mask
+
+
+def evaluate_all_passes(fn: Callable, sample_mask: jax.Array, *, capacity: int):
+    """Exact for any number of samples: as many buffers, one after another, as are needed.
+
+    Not differentiable in reverse mode (a while loop). Arguments as in `evaluate_one_pass`.
+
+    Returns:
+      outputs as [R, S, ...].
+    """
+    starts, count = row_starts(sample_mask)
+    total = starts[-1] + count[-1]
+
+    def one_pass(first):
+        packed = fn(*_packed_slots(starts, count, first, capacity))
+        return jax.tree.map(lambda x: _read_back(x, starts, first, sample_mask), packed)
+
+    def body(carry):
+        first, table = carry
+        return first + capacity, jax.tree.map(jnp.add, table, one_pass(first))
+
+    shapes = jax.eval_shape(one_pass, jnp.int32(0))
+    empty = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    return jax.lax.while_loop(lambda carry: carry[0] < total, body, (jnp.int32(0), empty))[1]

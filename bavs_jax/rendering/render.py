@@ -1,0 +1,95 @@
+"""The one renderer: training, images, curvature, uncertainty and clean-up all go through it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from bavs_jax.cameras import Rays
+from bavs_jax.rendering.compositing import composite, expected_depth, render_weights
+from bavs_jax.rendering.packing import evaluate_all_passes, evaluate_one_pass
+from bavs_jax.rendering.sampling import Samples
+
+
+@struct.dataclass
+class Rendering:
+    """What R rays see."""
+
+    rgb: jax.Array  # [R, 3] sRGB in [0, 1]
+    depth: jax.Array  # [R] distance along the ray, scene units; 0 on empty rays
+    opacity: jax.Array  # [R] in [0, 1]
+    channels: dict[str, jax.Array]  # each [R]
+    weights: jax.Array  # [R, S]
+    ray_mask: jax.Array  # [R] bool, false: the ray did not fit the buffer and must be left out
+
+
+class Channel(NamedTuple):
+    """One more quantity to composite like colour: `sum_i w_i value_i + (1 - sum_i w_i) floor`."""
+
+    value_fn: Callable  # positions [K, 3] -> [K]
+    floor: float = 0.0  # what a ray sees that meets nothing
+
+
+def render_rays(
+    rays: Rays,
+    samples: Samples,
+    field_fn: Callable,
+    *,
+    background,
+    capacity: int,
+    exact: bool,
+    displace_fn: Callable | None = None,
+    channels: Mapping[str, Channel] | None = None,
+) -> Rendering:
+    """Renders rays at given samples (Eqs 2-3).
+
+    Args:
+      rays: R rays.
+      samples: [R, S] where to look.
+      field_fn: (positions [K, 3], directions [K, 3]) -> (density [K], rgb [K, 3]).
+      background: [3] colour of what lies behind everything, or [R, 3].
+      capacity: places of the buffer in which valid samples are evaluated.
+      exact: true evaluates all samples in as many passes as needed, and cannot be differentiated
+        in reverse mode; false makes one pass and marks rays that did not fit in `ray_mask`.
+      displace_fn: positions [K, 3] -> offsets [K, 3] in scene units: the deformation `D(x)`; the
+        field is read at `x + D(x)`.
+      channels: more quantities to composite, by name; each reads the undisplaced position.
+
+    Returns:
+      `Rendering` of R rays.
+    """
+    channels = dict(channels or {})
+    num_slots = samples.t_mids.shape[1]
+
+    def evaluate(row, slot, valid):
+        t = samples.t_mids.reshape(-1)[row * num_slots + slot]
+        directions = rays.directions[row]
+        positions = rays.origins[row] + t[:, None] * directions
+        moved = positions if displace_fn is None else positions + displace_fn(positions)
+        density, rgb = field_fn(moved, directions)
+        extra = {name: channel.value_fn(positions) for name, channel in channels.items()}
+        return jnp.where(valid, density, 0.0), rgb, extra
+
+    if exact:
+        outputs = evaluate_all_passes(evaluate, samples.sample_mask, capacity=capacity)
+        ray_mask = jnp.ones(samples.t_mids.shape[0], bool)
+    else:
+        outputs, ray_mask = evaluate_one_pass(evaluate, samples.sample_mask, capacity=capacity)
+    density, rgb, extra = outputs
+
+    weights = render_weights(density, samples.deltas)
+    return Rendering(
+        rgb=composite(weights, rgb, background),
+        depth=expected_depth(weights, samples.t_mids),
+        opacity=weights.sum(-1),
+        channels={
+            name: composite(weights, value[..., None], channels[name].floor)[..., 0]
+            for name, value in extra.items()
+        },
+        weights=weights,
+        ray_mask=ray_mask,
+    )

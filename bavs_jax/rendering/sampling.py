@@ -1,0 +1,119 @@
+"""Where along a ray the field is evaluated: steps through the occupied cells of the scene box."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from bavs_jax.cameras import Rays
+from bavs_jax.numerics import safe_reciprocal
+from bavs_jax.rendering.occupancy import Occupancy, cell_index
+
+
+@struct.dataclass
+class Samples:
+    """Samples along R rays; the valid ones of a row come first."""
+
+    t_mids: jax.Array  # [R, S] distance along the ray, scene units
+    deltas: jax.Array  # [R, S] length a sample stands for, scene units, 0 where invalid
+    sample_mask: jax.Array  # [R, S] bool
+    thinned: jax.Array  # [R] bool, true where a ray had more occupied steps than slots
+
+
+@struct.dataclass
+class MarchOptions:
+    """How rays are stepped through the scene box; static, so each value compiles once."""
+
+    near: float = struct.field(pytree_node=False)  # closest distance along a ray, scene units
+    far: float = struct.field(pytree_node=False)  # farthest distance, scene units
+    step_size: float = struct.field(pytree_node=False)  # spacing, scene units
+    num_steps: int = struct.field(pytree_node=False)  # most steps of a ray
+    num_slots: int = struct.field(pytree_node=False)  # S, most samples of a ray
+
+
+def make_march_options(box, *, near, far, num_steps: int, num_slots: int) -> MarchOptions:
+    """Steps of one `num_steps`-th of the box's diagonal, so that any ray through it is covered."""
+    diagonal = float(np.linalg.norm(np.asarray(box)[1] - np.asarray(box)[0]))
+    return MarchOptions(
+        near=float(near),
+        far=float(far),
+        step_size=diagonal / num_steps,
+        num_steps=num_steps,
+        num_slots=num_slots,
+    )
+
+
+def box_interval(rays: Rays, box: jax.Array, near: float, far: float):
+    """Distances [R] at which rays enter and leave the box, within [near, far].
+
+    A ray that misses the box gets an empty interval (`t_enter >= t_leave`).
+    """
+    inverse = safe_reciprocal(rays.directions)
+    to_lower = (box[0] - rays.origins) * inverse
+    to_upper = (box[1] - rays.origins) * inverse
+    t_enter = jnp.minimum(to_lower, to_upper).max(-1)
+    t_leave = jnp.maximum(to_lower, to_upper).min(-1)
+    return jnp.maximum(t_enter, near), jnp.minimum(t_leave, far)
+
+
+def march(
+    rays: Rays, occupancy: Occupancy, options: MarchOptions, *, jitter: jax.Array | None = None
+) -> Samples:
+    """Even steps through the scene box, kept where the cell is occupied.
+
+    `t_i = t_enter + (i + jitter) step_size` for `t_i < t_leave`. A ray with more than `num_slots`
+    occupied steps keeps every n-th of them with n times the length, so its whole way is still
+    integrated, more coarsely; such rays are marked in `thinned`.
+
+    Args:
+      rays: R rays.
+      occupancy: the grid, whose box bounds the way.
+      options: spacing and limits; `num_steps * step_size` should reach through the box.
+      jitter: [R] in [0, 1), place of the sample within each step; 0.5 when None.
+
+    Returns:
+      `Samples` [R, S].
+    """
+    num_rays = rays.origins.shape[0]
+    step_size, num_slots = options.step_size, options.num_slots
+    t_enter, t_leave = box_interval(rays, occupancy.box, options.near, options.far)
+    place = jnp.full(num_rays, 0.5) if jitter is None else jitter
+    t = t_enter[:, None] + (jnp.arange(options.num_steps) + place[:, None]) * step_size
+    positions = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
+    cell = cell_index(occupancy, positions)
+    hit = occupancy.occupied.at[cell].get(mode="promise_in_bounds") & (t < t_leave[:, None])
+
+    rank = jnp.cumsum(hit.astype(jnp.int32), axis=1)  # 1-based number of a hit in its row
+    total = rank[:, -1]
+    stride = jnp.maximum((total + num_slots - 1) // num_slots, 1)
+    count = (total + stride - 1) // stride
+    # Slot m holds the hit number m * stride + 1.
+    wanted = jnp.arange(num_slots) * stride[:, None] + 1
+    step = _first_step_with_rank(rank, wanted)
+    sample_mask = jnp.arange(num_slots) < count[:, None]
+    t_mids = t_enter[:, None] + (step + place[:, None]) * step_size
+    deltas = jnp.where(sample_mask, (step_size * stride)[:, None], 0.0)
+    return Samples(
+        t_mids=jnp.where(sample_mask, t_mids, options.far),
+        deltas=deltas,
+        sample_mask=sample_mask,
+        thinned=total > num_slots,
+    )
+
+
+def _first_step_with_rank(rank: jax.Array, wanted: jax.Array) -> jax.Array:
+    """For each row, the first column where `rank >= wanted`, by binary search; [R, S] int."""
+    num_rays, num_steps = rank.shape
+    rows = (jnp.arange(num_rays) * num_steps)[:, None]
+    flat = rank.reshape(-1)
+    below = jnp.zeros_like(wanted)  # columns known to be too small
+    stride = 1 << (num_steps - 1).bit_length()
+    while stride:
+        probe = below + stride
+        column = jnp.minimum(probe, num_steps) - 1
+        value = flat.at[rows + column].get(mode="promise_in_bounds")
+        below = jnp.where((probe <= num_steps) & (value < wanted), probe, below)
+        stride >>= 1
+    return jnp.minimum(below, num_steps - 1)

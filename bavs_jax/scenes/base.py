@@ -1,0 +1,72 @@
+"""What a scene is: posed images in one flat pixel table, with splits, box and background."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from bavs_jax.cameras import Cameras
+
+
+class SceneError(ValueError):
+    """Input that cannot be used: one line that names the file, the field and the fix."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """Posed images of one static scene, on the host.
+
+    All pixels lie in one table so that images of mixed sizes, and training sets that grow,
+    share one code: view v owns rows `offsets[v]:offsets[v + 1]`, in row order.
+    """
+
+    name: str
+    cameras: Cameras  # V views
+    pixels: np.ndarray  # [N, 3] uint8 sRGB, already over the background where there was alpha
+    offsets: np.ndarray  # [V + 1] int64
+    pool: np.ndarray  # [P] int32 views that may be trained on or chosen
+    test: np.ndarray  # [T] int32 views that are only measured
+    box: np.ndarray  # [2, 3] float32 lower and upper corner, scene units
+    near: float  # closest distance along a ray, scene units
+    far: float  # farthest distance, scene units
+    background: np.ndarray  # [3] float32 sRGB in [0, 1]
+    names: tuple[str, ...]  # [V] a name for each view: its file, relative to the scene's folder
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # unit
+    depth: np.ndarray | None = None  # [N] float32 distance along the ray, 0 where unknown or empty
+    pixel_mask: np.ndarray | None = None  # [N] bool, False: ignore this pixel
+    # [4, 4] float64 similarity from scene coordinates to those of the user's own file.
+    user_from_scene: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(4))
+
+    @property
+    def num_views(self) -> int:
+        return len(self.names)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Middle of the scene box [3], scene units."""
+        return self.box.mean(axis=0)
+
+    def view_slice(self, view_id: int) -> slice:
+        """Rows of the pixel table that belong to a view."""
+        return slice(int(self.offsets[view_id]), int(self.offsets[view_id + 1]))
+
+    def image(self, view_id: int) -> np.ndarray:
+        """One view as [H, W, 3] uint8."""
+        width, height = (int(n) for n in self.cameras.sizes[view_id])
+        return self.pixels[self.view_slice(view_id)].reshape(height, width, 3)
+
+    def depth_image(self, view_id: int) -> np.ndarray | None:
+        """One view's true depth as [H, W] float32 with 0 where unknown, or None."""
+        if self.depth is None:
+            return None
+        width, height = (int(n) for n in self.cameras.sizes[view_id])
+        return self.depth[self.view_slice(view_id)].reshape(height, width)
+
+
+def pixel_table(images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Stacks images [H_v, W_v, ...] into rows [N, ...] and their offsets [V + 1]."""
+    counts = [image.shape[0] * image.shape[1] for image in images]
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    rows = np.concatenate([im.reshape(n, *im.shape[2:]) for im, n in zip(images, counts)])
+    return rows, offsets

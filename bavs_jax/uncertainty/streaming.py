@@ -1,0 +1,125 @@
+"""Curvature over any number of rays in bounded memory: rays are grouped by their samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bavs_jax.fields.base import Field
+from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.rendering.sampling import MarchOptions, march
+from bavs_jax.training.batches import PixelTable, pixel_colours, view_pixel_rays
+from bavs_jax.uncertainty.curvature import add_jac_sq_sum
+
+
+def training_pixels(table: PixelTable, is_training_view) -> tuple[np.ndarray, np.ndarray]:
+    """All pixels of the training views that are not masked: view ids [N] and row numbers [N]."""
+    offsets, mask = np.asarray(table.offsets), np.asarray(table.pixel_mask)
+    views = np.flatnonzero(is_training_view)
+    view_ids = np.repeat(views, np.diff(offsets)[views]).astype(np.int32)
+    within = np.concatenate([np.arange(offsets[v + 1] - offsets[v]) for v in views])
+    within = within.astype(np.int32)
+    if len(mask) > 1:
+        keep = mask[offsets[view_ids] + within]
+        view_ids, within = view_ids[keep], within[keep]
+    return view_ids, within
+
+
+def make_curvature_fn(
+    field: Field,
+    grid: DeformationGrid,
+    march_options: MarchOptions,
+    *,
+    background,
+    weighting: str = "eq13",
+    buckets: tuple[int, ...] = (8, 16, 32, 64),
+    chunk_samples: int = 32768,
+) -> Callable:
+    """Makes the streamed raw Jacobian sum (Eqs 10-13) over given pixels.
+
+    `vmap(jacrev)` needs a fixed number of samples a ray. Rays are sorted into buckets by how many
+    occupied samples they have, so that short ones are not padded to the longest; rays that meet
+    nothing have no curvature and are not evaluated.
+
+    Args:
+      field: the radiance field.
+      grid: the deformation grid.
+      march_options: how rays are sampled.
+      background: [3] colour behind everything.
+      weighting: one of `curvature.WEIGHTINGS`.
+      buckets: sample slots of each compiled shape; the march's `num_slots` is added if larger.
+      chunk_samples: slots of one compiled call.
+
+    Returns:
+      `curvature(params, occupancy, table, view_ids [N], within [N], progress_fn=None)` ->
+      `jac_sq_sum` [G, 3]. `progress_fn(n)` is called with the number of rays done.
+    """
+    slots = march_options.num_slots
+    buckets = tuple(sorted({b for b in buckets if b < slots} | {slots}))
+    background = jnp.asarray(background, jnp.float32)
+    count_chunk = 8192
+
+    @jax.jit
+    def count_samples(occupancy, table, view_ids, within):
+        rays = view_pixel_rays(table.cameras, view_ids, within)
+        return march(rays, occupancy, march_options).sample_mask.sum(-1)
+
+    @partial(jax.jit, static_argnames="bucket", donate_argnums=0)
+    def add_chunk(total, params, occupancy, table, view_ids, within, ray_weight, *, bucket):
+        rays = view_pixel_rays(table.cameras, view_ids, within)
+        samples = march(rays, occupancy, march_options.replace(num_slots=bucket))
+        return add_jac_sq_sum(
+            total,
+            partial(field.apply, params),
+            grid,
+            rays,
+            samples,
+            background=background,
+            target=None if weighting == "eq13" else pixel_colours(table, view_ids, within),
+            ray_weight=ray_weight,
+            weighting=weighting,
+        )
+
+    def curvature(params, occupancy, table, view_ids, within, progress_fn=None):
+        total = jnp.zeros((grid.num_vertices, 3))
+        counts = []
+        for rows, num in _chunks(np.arange(len(view_ids)), count_chunk):
+            counts.append(
+                np.asarray(count_samples(occupancy, table, view_ids[rows], within[rows]))[:num]
+            )
+        counts = np.concatenate(counts)
+        report = progress_fn or (lambda num: None)
+        report(int((counts == 0).sum()))
+        smaller = 0
+        for bucket in buckets:
+            members = np.flatnonzero((counts > smaller) & (counts <= bucket))
+            smaller = bucket
+            chunk = max(chunk_samples // bucket, 1)
+            for rows, num in _chunks(members, chunk):
+                total = add_chunk(
+                    total,
+                    params,
+                    occupancy,
+                    table,
+                    view_ids[rows],
+                    within[rows],
+                    (np.arange(chunk) < num).astype(np.float32),
+                    bucket=bucket,
+                )
+                # The host would otherwise run ahead and queue every chunk's buffers at once.
+                jax.block_until_ready(total)
+                report(num)
+        return total
+
+    return curvature
+
+
+def _chunks(rows: np.ndarray, size: int):
+    """Pieces of `rows` of exactly `size`, the last filled up, with their true lengths."""
+    for start in range(0, len(rows), size):
+        piece = rows[start : start + size]
+        yield np.pad(piece, (0, size - len(piece)), mode="edge"), len(piece)

@@ -1,0 +1,41 @@
+"""Small smooth fields with known form, for tests of rendering and curvature."""
+
+import jax
+import jax.numpy as jnp
+
+from bavs_jax.cameras import Rays
+from bavs_jax.fields.base import Field
+
+
+def smooth_field_fn(positions, directions):
+    """Density and colour that vary with position in every axis, and with direction."""
+    x, y, z = positions[..., 0], positions[..., 1], positions[..., 2]
+    density = 1.5 + jnp.sin(2.0 * x + y) * jnp.cos(1.5 * z - 0.5 * x)
+    rgb = jnp.stack(
+        [
+            0.5 + 0.4 * jnp.sin(3.0 * x + directions[..., 0]),
+            0.5 + 0.3 * jnp.cos(2.0 * y - z),
+            0.5 + 0.2 * jnp.sin(x * y + 2.0 * z),
+        ],
+        axis=-1,
+    )
+    return density, rgb
+
+
+def smooth_field() -> Field:
+    """`smooth_field_fn` behind the interface of a field; it has no parameters."""
+    return Field(
+        init=lambda key: {},
+        apply=lambda params, x, d: smooth_field_fn(x, d),
+        density=lambda params, x: smooth_field_fn(x, x)[0],
+    )
+
+
+def rays_through(key, num, box_half_side=1.0):
+    """Rays from outside of a cube towards random points inside of it."""
+    outside_key, inside_key = jax.random.split(key)
+    outside = jax.random.normal(outside_key, (num, 3))
+    outside = 3.0 * outside / jnp.linalg.norm(outside, axis=-1, keepdims=True)
+    inside = jax.random.uniform(inside_key, (num, 3), minval=-0.6, maxval=0.6) * box_half_side
+    directions = inside - outside
+    return Rays(outside, directions / jnp.linalg.norm(directions, axis=-1, keepdims=True))
