@@ -1,0 +1,128 @@
+"""What a policy may look at when it scores candidates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from flax import struct
+
+
+class SelectionError(ValueError):
+    """A selection that cannot be made: one line that names the cause and the fix."""
+
+
+@struct.dataclass
+class Context:
+    """C candidate cameras, the V views that may be trained on, and sources of scores.
+
+    All arrays keep their shapes while views are added: only the masks change. The callables close
+    over parameters that change every round, so a `Context` must not be passed into `jax.jit`
+    whole: jit over its arrays.
+
+    A policy that needs something new gets one more optional field here, with a default of None,
+    and reads it through `require`; the caller fills it where the policy's `needs` ask for it.
+    Sources take indices and stream over them, so that only candidates which are still in `mask`
+    cost anything.
+    """
+
+    positions: jax.Array  # [C, 3] candidate camera centres, scene units
+    view_ids: jax.Array  # [C] int32, distinct, >= 0: settle ties and seed random draws
+    mask: jax.Array  # [C] bool, which candidates may be picked now
+    picked: jax.Array  # [C] bool, the batch chosen so far; kept by `acquire`
+    training_positions: jax.Array  # [V, 3] scene units
+    is_training_view: jax.Array  # [V] bool
+    centre: jax.Array  # [3] scene centre, scene units
+    # Eq 15: candidate indices int [n] -> mean uncertainty of each one's render, float [n].
+    mean_uncertainty_fn: Callable | None = struct.field(pytree_node=False, default=None)
+
+
+def make_context(
+    positions,
+    *,
+    training_positions,
+    is_training_view,
+    centre,
+    view_ids=None,
+    mask=None,
+    mean_uncertainty_fn: Callable | None = None,
+) -> Context:
+    """Checks and builds a `Context`, on the host.
+
+    Args:
+      positions: [C, 3] candidate camera centres, scene units.
+      training_positions: [V, 3] centres of all views that may be trained on, scene units.
+      is_training_view: [V] bool, which of them are trained on now.
+      centre: [3] scene centre, scene units.
+      view_ids: [C] distinct integers >= 0; default 0 .. C - 1.
+      mask: [C] bool, which candidates may be picked; default all.
+      mean_uncertainty_fn: Eq 15 for given candidates, indices [n] -> [n].
+
+    Returns:
+      A `Context` with nothing picked yet.
+
+    Raises:
+      SelectionError: on a wrong shape, a position that is not finite, or repeated view ids.
+    """
+    num = len(positions)
+    arrays = {
+        "positions": np.asarray(positions, np.float32),
+        "view_ids": np.asarray(np.arange(num) if view_ids is None else view_ids, np.int32),
+        "mask": np.asarray(np.ones(num) if mask is None else mask, bool),
+        "training_positions": np.asarray(training_positions, np.float32),
+        "is_training_view": np.asarray(is_training_view, bool),
+        "centre": np.asarray(centre, np.float32),
+    }
+    shapes = {
+        "positions": (num, 3),
+        "view_ids": (num,),
+        "mask": (num,),
+        "training_positions": (len(training_positions), 3),
+        "is_training_view": (len(training_positions),),
+        "centre": (3,),
+    }
+    for name, array in arrays.items():
+        if array.shape != shapes[name]:
+            raise SelectionError(f"{name}: shape {array.shape}, but it must be {shapes[name]}")
+        if not np.isfinite(array).all():
+            raise SelectionError(f"{name}: not finite; give unused slots any finite position")
+    view_ids = arrays["view_ids"]
+    if len(np.unique(view_ids)) != num or (view_ids < 0).any():
+        raise SelectionError("view_ids: must be distinct and >= 0, for they settle ties")
+    return Context(**arrays, picked=np.zeros(num, bool), mean_uncertainty_fn=mean_uncertainty_fn)
+
+
+def require(ctx: Context, field: str):
+    """The field of `ctx` with that name; raises SelectionError if the caller gave none."""
+    value = getattr(ctx, field)
+    if value is None:
+        raise SelectionError(f"{field}: this policy needs it; give it to make_context")
+    return value
+
+
+def mark_picked(ctx: Context, index: int) -> Context:
+    """`ctx` after candidate `index` joined the batch: in `picked`, no longer in `mask`."""
+    is_pick = np.arange(len(ctx.mask)) == index
+    return ctx.replace(mask=np.asarray(ctx.mask) & ~is_pick, picked=ctx.picked | is_pick)
+
+
+def score_candidates(ctx: Context, source_fn: Callable) -> np.ndarray:
+    """Scores [C] from a source that is asked only for the candidates in `mask`; NaN elsewhere.
+
+    Args:
+      ctx: the candidates.
+      source_fn: candidate indices int [n] -> scores [n].
+
+    Raises:
+      SelectionError: if the source returns another shape than [n].
+    """
+    indices = np.flatnonzero(ctx.mask)
+    values = np.asarray(source_fn(indices))
+    if values.shape != indices.shape:
+        raise SelectionError(
+            f"scores: shape {values.shape} for {len(indices)} candidates; return one number each"
+        )
+    scores = np.full(len(ctx.mask), np.nan, np.float32)
+    scores[indices] = values
+    return scores

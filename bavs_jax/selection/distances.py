@@ -1,0 +1,215 @@
+"""Distances between cameras and the maximum-minimum distance policy (Fig 5)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+DEFAULT_RADIUS = 0.2  # of the median camera distance from the scene centre
+DEFAULT_SHRINK = 0.8
+DEFAULT_MAX_SHRINKS = 32  # radii end at 0.8^32 < 1e-3 of where they began
+
+
+class Radii(NamedTuple):
+    """How far apart the max-min distance filter keeps cameras, scene units."""
+
+    min_train_distance: jax.Array  # [] from a candidate to every training view
+    min_candidate_distance: jax.Array  # [] between two candidates
+
+
+class FilterInfo(NamedTuple):
+    """What the max-min distance filter did."""
+
+    num_survivors: jax.Array  # [] int32
+    shrinks: jax.Array  # [] int32, how often both radii were shrunk
+    radii: Radii  # the radii of the last attempt
+    fell_back: jax.Array  # [] bool, too few survived every attempt: all of `mask` was kept
+
+
+def pairwise_distances(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Euclidean distances `|a_n - b_m|`.
+
+    Args:
+      a: [..., N, 3] scene units.
+      b: [..., M, 3] scene units.
+
+    Returns:
+      [..., N, M] scene units.
+    """
+    # By differences, not |a|^2 + |b|^2 - 2 a.b: that loses near neighbours to cancellation.
+    difference = a[..., :, None, :] - b[..., None, :, :]
+    return jnp.sqrt(jnp.sum(difference * difference, axis=-1))
+
+
+def nearest_distances(points: jax.Array, others: jax.Array, is_valid: jax.Array) -> jax.Array:
+    """Distance of each point to the nearest valid one of others.
+
+    Args:
+      points: [C, 3] scene units.
+      others: [V, 3] scene units.
+      is_valid: [V] bool.
+
+    Returns:
+      [C] scene units; infinity where nothing is valid.
+    """
+    return masked_nearest(pairwise_distances(points, others), is_valid)
+
+
+def masked_nearest(distances: jax.Array, is_valid: jax.Array) -> jax.Array:
+    """Smallest of distances [C, V] over valid columns; [C], infinity where nothing is valid."""
+    return jnp.min(jnp.where(is_valid, distances, jnp.inf), axis=-1, initial=jnp.inf)
+
+
+def default_radii(
+    positions: jax.Array,
+    mask: jax.Array,
+    training_positions: jax.Array,
+    is_training_view: jax.Array,
+    centre: jax.Array,
+) -> Radii:
+    """Both radii: 0.2 of the median camera distance from the scene centre.
+
+    The median runs over candidates and training views together, so that it stays the same while
+    views of one pool move from the former to the latter.
+
+    Args:
+      positions: [C, 3] candidates, scene units.
+      mask: [C] bool, which of them count.
+      training_positions: [V, 3] scene units.
+      is_training_view: [V] bool, which of them count.
+      centre: [3] scene units.
+
+    Returns:
+      `Radii`, both equal, scene units.
+    """
+    cameras = jnp.concatenate([positions, training_positions])
+    counts = jnp.concatenate([mask, is_training_view])
+    distance = pairwise_distances(cameras, centre[None])[:, 0]
+    radius = DEFAULT_RADIUS * jnp.nanmedian(jnp.where(counts, distance, jnp.nan))
+    return Radii(radius, radius)
+
+
+def max_min_filter(
+    positions: jax.Array,
+    training_positions: jax.Array,
+    is_training_view: jax.Array,
+    mask: jax.Array,
+    num_wanted: int | jax.Array,
+    *,
+    view_ids: jax.Array,
+    radii: Radii,
+    shrink: float | jax.Array = DEFAULT_SHRINK,
+    max_shrinks: int | jax.Array = DEFAULT_MAX_SHRINKS,
+) -> tuple[jax.Array, FilterInfo]:
+    """Candidates far from all training views and from each other (Fig 5).
+
+    Visits candidates from the largest distance to their nearest training view down, ties to the
+    smallest view id, and keeps one if it is at least `min_train_distance` from every training view
+    and at least `min_candidate_distance` from every candidate kept before. While fewer than
+    `num_wanted` survive, multiplies both radii by `shrink` and begins again.
+
+    Args:
+      positions: [C, 3] candidates, scene units.
+      training_positions: [V, 3] scene units.
+      is_training_view: [V] bool.
+      mask: [C] bool, which candidates may survive.
+      num_wanted: how many have to survive at least.
+      view_ids: [C] int, distinct.
+      radii: what to begin with, scene units, >= 0.
+      shrink: factor in (0, 1).
+      max_shrinks: bound of the loop, >= 0; beyond it all of `mask` is kept and
+        `FilterInfo.fell_back` says so (also where `num_wanted` is more than `mask` has).
+
+    Returns:
+      survivors [C] bool, within `mask`, and `FilterInfo`.
+
+    Everything but shapes may be traced. One attempt costs O(C) per survivor, and an attempt that
+    fails has fewer than `num_wanted` of them.
+    """
+    nearest = nearest_distances(positions, training_positions, is_training_view)
+    visit = jnp.lexsort((view_ids, -nearest))
+    points, nearest, allowed = positions[visit], nearest[visit], mask[visit]
+
+    def radii_after(shrinks):
+        factor = jnp.asarray(shrink, nearest.dtype) ** shrinks
+        return Radii(*(factor * r for r in radii))
+
+    def attempt(state):
+        _, num_attempts = state
+        tried = radii_after(num_attempts)
+
+        # One step for each candidate kept, not for each visited: the next one to keep is the
+        # first, in order of visit, that is still far enough from all kept before.
+        def keep_next(state):
+            kept, eligible = state
+            first = jnp.argmax(eligible)
+            apart = pairwise_distances(points, points[first][None])[:, 0]
+            eligible = eligible & (apart >= tried.min_candidate_distance)
+            return kept.at[first].set(True), eligible.at[first].set(False)
+
+        start = (jnp.zeros_like(allowed), allowed & (nearest >= tried.min_train_distance))
+        kept, _ = jax.lax.while_loop(lambda state: state[1].any(), keep_next, start)
+        return kept, num_attempts + 1
+
+    def goes_on(state):
+        kept, num_attempts = state
+        too_few = (num_attempts == 0) | (kept.sum() < num_wanted)
+        return too_few & (num_attempts <= max_shrinks)
+
+    kept, num_attempts = jax.lax.while_loop(
+        goes_on, attempt, (jnp.zeros_like(allowed), jnp.zeros((), jnp.int32))
+    )
+    fell_back = kept.sum() < num_wanted
+    kept = jnp.where(fell_back, allowed, kept)
+    info = FilterInfo(
+        num_survivors=kept.sum(),
+        shrinks=num_attempts - 1,
+        radii=radii_after(num_attempts - 1),
+        fell_back=fell_back,
+    )
+    return jnp.zeros_like(mask).at[visit].set(kept), info
+
+
+def farthest_ranks(
+    positions: jax.Array,
+    training_positions: jax.Array,
+    is_training_view: jax.Array,
+    mask: jax.Array,
+    num_picks: int | jax.Array,
+    *,
+    view_ids: jax.Array,
+) -> jax.Array:
+    """Order in which farthest-view sampling would pick the candidates.
+
+    Each pick is the candidate whose nearest training view or earlier pick is farthest, ties to
+    the smallest view id.
+
+    Args:
+      positions: [C, 3] candidates, scene units.
+      training_positions: [V, 3] scene units.
+      is_training_view: [V] bool.
+      mask: [C] bool, which candidates may be picked.
+      num_picks: how many to pick; no more than `mask` has are picked.
+      view_ids: [C] int, distinct.
+
+    Returns:
+      [C] int32: 0 for the first pick, 1 for the next, ...; C for those never picked.
+    """
+    nearest = nearest_distances(positions, training_positions, is_training_view)
+    by_id = jnp.argsort(view_ids)  # argmax takes the first of equals: the smallest id
+    points, start = positions[by_id], jnp.where(mask, nearest, -jnp.inf)[by_id]
+
+    def pick(step, state):
+        ranks, nearest = state
+        farthest = jnp.argmax(nearest)
+        apart = pairwise_distances(points, points[farthest][None])[:, 0]
+        nearest = jnp.minimum(nearest, apart).at[farthest].set(-jnp.inf)
+        return ranks.at[farthest].set(step), nearest
+
+    num = mask.shape[0]
+    never = jnp.full((num,), num, jnp.int32)
+    last = jnp.minimum(num_picks, mask.sum())
+    ranks, _ = jax.lax.fori_loop(0, last, pick, (never, start))
+    return never.at[by_id].set(ranks)

@@ -1,0 +1,40 @@
+"""The table of policies: every module here holds one `POLICY`, which registers itself.
+
+To add a policy, write one file with a `POLICY = Policy(name=<the file's name>, ...)`; the command
+line, the sweep, the report and the battery of tests then know it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import pkgutil
+
+from bavs_jax.selection.context import SelectionError
+from bavs_jax.selection.policy import Policy
+
+
+def collect_policies() -> dict[str, Policy]:
+    """Imports every module of this package; raises SelectionError at one without its POLICY."""
+    table = {}
+    for module_info in pkgutil.iter_modules(__path__):
+        name = module_info.name
+        policy = getattr(importlib.import_module(f"{__name__}.{name}"), "POLICY", None)
+        if policy is None or policy.name != name:
+            raise SelectionError(
+                f"policies/{name}.py: must hold POLICY = Policy(name={name!r}, ...)"
+            )
+        table[name] = policy
+    return table
+
+
+POLICIES: dict[str, Policy] = collect_policies()
+
+
+def get_policy(name: str) -> Policy:
+    """The policy of that name; raises SelectionError with the known names if there is none."""
+    if name in POLICIES:
+        return POLICIES[name]
+    close = difflib.get_close_matches(name, POLICIES, n=1)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    raise SelectionError(f"policy: unknown name {name!r}; {hint}known: {', '.join(POLICIES)}")
