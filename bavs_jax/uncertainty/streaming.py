@@ -37,7 +37,7 @@ def make_curvature_fn(
     background,
     weighting: str = "eq13",
     buckets: tuple[int, ...] = (8, 16, 32, 64),
-    chunk_samples: int = 32768,
+    chunk_samples: int = 4096,
 ) -> Callable:
     """Makes the streamed raw Jacobian sum (Eqs 10-13) over given pixels.
 

@@ -1,0 +1,198 @@
+"""The loop of the paper (Fig 2): train, find out where the field is uncertain, choose views.
+
+`step(key, state) -> (state, info)` is one round. All of its randomness comes from `key` and the
+state's counters, so a run that is stopped and picked up goes the same way.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from bavs_jax.candidates import Candidates, CandidateSource
+from bavs_jax.selection.batch import SelectionInfo, acquire
+from bavs_jax.selection.context import make_context
+from bavs_jax.selection.policy import Policy
+from bavs_jax.training.batches import PixelTable
+from bavs_jax.training.train import TrainState
+from bavs_jax.uncertainty.streaming import training_pixels
+
+
+@struct.dataclass
+class ActiveState:
+    """What must be carried from round to round, and inside of one."""
+
+    train: TrainState
+    table: PixelTable  # the views' pictures; changes only where new ones are taken
+    is_training_view: jax.Array  # [V] bool
+    round: jax.Array  # [] int32, 0 while only the initial views are there
+    calls: jax.Array  # [] int32, compiled training calls done in this round
+
+
+class Choice(NamedTuple):
+    """How a batch was chosen; only reports."""
+
+    view_ids: np.ndarray  # [k] rows of the pixel table, in the order of picking
+    selected: np.ndarray  # [k] the same as indices of the candidates
+    candidates: Candidates
+    selection: SelectionInfo
+    seconds: dict[str, float]  # curvature, score, select
+
+
+class RoundInfo(NamedTuple):
+    """What one round reports."""
+
+    round: int
+    choice: Choice | None  # None in round 0, and where a round was picked up half way
+    train_seconds: float
+
+
+class Stages(NamedTuple):
+    """The parts of a round as functions, put together by the caller.
+
+    `train_call(key, train_state, table, is_training_view) -> (train_state, TrainInfo)`
+    `restart(key, train_state) -> train_state` at the start of each round after the first: a fresh
+      optimiser, and fresh parameters too where each round trains from scratch.
+    `curvature(train_state, table, view_ids [N], within [N]) -> jac_sq_sum`
+    `make_score_fn(train_state, jac_sq_sum, cameras) -> (indices [n] -> scores [n])`
+    """
+
+    train_call: Callable
+    restart: Callable
+    curvature: Callable
+    make_score_fn: Callable
+
+
+def init_active_state(train: TrainState, table: PixelTable, initial_views) -> ActiveState:
+    """A state before its first training call, with the initial views (given as ids) in use."""
+    is_training = np.zeros(len(table.cameras), bool)
+    is_training[np.asarray(initial_views)] = True
+    return ActiveState(
+        train=train,
+        table=table,
+        is_training_view=jnp.asarray(is_training),
+        round=jnp.int32(0),
+        calls=jnp.int32(0),
+    )
+
+
+def make_active_step(
+    policy: Policy,
+    stages: Stages,
+    source: CandidateSource,
+    *,
+    centre,
+    batch_size: int,
+    calls_per_round: int,
+    max_curvature_rays: int | None = None,
+    radii=None,
+    mode: str | None = None,
+) -> Callable:
+    """Makes `step(key, state, on_choice=None, on_call=None) -> (state, RoundInfo)`.
+
+    A step finishes the round that the state is in; if that round is complete, it first chooses
+    the next batch of views and opens a new round. `on_choice(state, choice)` and
+    `on_call(state, train_info)` are called as things happen, for reports and checkpoints.
+
+    Args:
+      policy: who chooses.
+      stages: how to train, differentiate and score.
+      source: where candidates come from.
+      centre: [3] scene centre, scene units.
+      batch_size: views chosen at once.
+      calls_per_round: compiled training calls of a round.
+      max_curvature_rays: if there are more training rays than this, a uniform subset of so many
+        stands for them and its sum is scaled up.
+      radii: of the max-min distance filter; by default from the cameras.
+      mode: "top_k" or "greedy"; by default the policy's own.
+    """
+
+    def curvature(key, state):
+        view_ids, within = training_pixels(state.table, state.is_training_view)
+        scale = 1.0
+        if max_curvature_rays is not None and len(view_ids) > max_curvature_rays:
+            seed = int(jax.random.randint(key, (), 0, 2**31 - 1))
+            rows = np.random.default_rng(seed).permutation(len(view_ids))[:max_curvature_rays]
+            scale = len(view_ids) / max_curvature_rays
+            view_ids, within = view_ids[np.sort(rows)], within[np.sort(rows)]
+        return scale * stages.curvature(state.train, state.table, view_ids, within)
+
+    def choose(key, state):
+        propose_key, curvature_key, policy_key = jax.random.split(key, 3)
+        seconds = dict.fromkeys(("curvature", "score", "select"), 0.0)
+        candidates = source.propose(propose_key, state.table, state.is_training_view)
+
+        start = time.perf_counter()
+        jac_sq_sum = None
+        if "curvature" in policy.needs:
+            jac_sq_sum = jax.block_until_ready(curvature(curvature_key, state))
+            seconds["curvature"] = time.perf_counter() - start
+
+        def score(indices):
+            score_start = time.perf_counter()
+            fn = stages.make_score_fn(state.train, jac_sq_sum, candidates.cameras)
+            scores = fn(indices)
+            seconds["score"] += time.perf_counter() - score_start
+            return scores
+
+        start = time.perf_counter()
+        context = make_context(
+            candidates.cameras.positions,
+            view_ids=candidates.view_ids,
+            mask=candidates.mask,
+            training_positions=state.table.cameras.positions,
+            is_training_view=state.is_training_view,
+            centre=centre,
+            mean_uncertainty_fn=score,
+        )
+        selected, selection = acquire(
+            policy, policy_key, context, batch_size, radii=radii, mode=mode
+        )
+        seconds["select"] = time.perf_counter() - start - seconds["score"]
+        table, view_ids = source.acquire(
+            state.table, state.is_training_view, candidates, selected
+        )
+        state = state.replace(
+            table=table,
+            is_training_view=state.is_training_view.at[view_ids].set(True),
+            round=state.round + 1,
+            calls=jnp.int32(0),
+        )
+        return state, Choice(view_ids, selected, candidates, selection, seconds)
+
+    def step(key, state, on_choice=None, on_call=None):
+        choice = None
+        if int(state.calls) >= calls_per_round:
+            choose_key, restart_key, _ = _round_keys(key, int(state.round) + 1)
+            state, choice = choose(choose_key, state)
+            state = state.replace(train=stages.restart(restart_key, state.train))
+            if on_choice is not None:
+                on_choice(state, choice)
+
+        _, _, train_key = _round_keys(key, int(state.round))
+        start = time.perf_counter()
+        for call in range(int(state.calls), calls_per_round):
+            train, train_info = stages.train_call(
+                jax.random.fold_in(train_key, call),
+                state.train,
+                state.table,
+                state.is_training_view,
+            )
+            state = state.replace(train=train, calls=jnp.int32(call + 1))
+            if on_call is not None:
+                on_call(state, train_info)
+        jax.block_until_ready(state.train.step)
+        return state, RoundInfo(int(state.round), choice, time.perf_counter() - start)
+
+    return step
+
+
+def _round_keys(key, number: int):
+    """Keys of a round for choosing, restarting and training."""
+    return jax.random.split(jax.random.fold_in(key, number), 3)

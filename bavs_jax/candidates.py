@@ -1,0 +1,140 @@
+"""Where candidate views come from, and how a chosen one becomes a training image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bavs_jax.cameras import Cameras, hemisphere_poses, take
+from bavs_jax.scenes.base import Scene
+from bavs_jax.training.batches import PixelTable
+
+
+class Candidates(NamedTuple):
+    """C cameras to choose from; those outside of `mask` are not on offer."""
+
+    cameras: Cameras  # [C]
+    view_ids: np.ndarray  # [C] int32, distinct
+    mask: np.ndarray  # [C] bool
+
+
+class CandidateSource(NamedTuple):
+    """Where candidates come from.
+
+    `propose(key, table, is_training_view) -> Candidates`, of the same C at every call.
+    `acquire(table, is_training_view, candidates, selected [k]) -> (table, view ids [k])`: takes
+    the pictures; the view ids are rows of the table that may be trained on from now on.
+    """
+
+    propose: Callable
+    acquire: Callable
+
+
+def dataset_candidates(scene: Scene, *, hemisphere_draws: int | None = None) -> CandidateSource:
+    """The unused views of a scene's pool.
+
+    Args:
+      scene: the scene.
+      hemisphere_draws: None offers every unused view. A number draws that many poses on the
+        hemisphere (Eq 14) and offers the nearest unused view of each.
+    """
+    pool = np.asarray(scene.pool)
+    cameras = take(scene.cameras, pool)
+    positions = np.asarray(cameras.positions)
+
+    def propose(key, table, is_training_view):
+        del table
+        mask = ~np.asarray(is_training_view)[pool]
+        if hemisphere_draws is not None and mask.any():
+            unused = np.flatnonzero(mask)
+            poses = scene_hemisphere(key, scene, hemisphere_draws)
+            distance = np.linalg.norm(poses[:, None, :, 3] - positions[unused], axis=-1)
+            mask = np.zeros_like(mask)
+            mask[unused[distance.argmin(axis=1)]] = True
+        return Candidates(cameras, pool.astype(np.int32), mask)
+
+    def acquire(table, is_training_view, candidates, selected):
+        del is_training_view
+        return table, candidates.view_ids[np.asarray(selected)]
+
+    return CandidateSource(propose, acquire)
+
+
+def captured_candidates(
+    scene: Scene, capture_fn: Callable, *, num_candidates: int, first_slot: int
+) -> CandidateSource:
+    """Free poses on the hemisphere (Eq 14), photographed when they are chosen.
+
+    Args:
+      scene: the scene, with empty views from `first_slot` on (see `with_empty_views`).
+      capture_fn: `Cameras` [k] -> pixels [k * H * W, 3] uint8.
+      num_candidates: C.
+      first_slot: first view that a picture may be put into.
+    """
+    first_view = take(scene.cameras, np.asarray(scene.pool)[:1])
+
+    def propose(key, table, is_training_view):
+        del table, is_training_view
+        poses = scene_hemisphere(key, scene, num_candidates)
+        cameras = jax.tree.map(lambda x: np.repeat(np.asarray(x), num_candidates, 0), first_view)
+        return Candidates(
+            cameras.replace(world_from_cam=poses),
+            np.arange(num_candidates, dtype=np.int32),
+            np.ones(num_candidates, bool),
+        )
+
+    def acquire(table, is_training_view, candidates, selected):
+        selected = np.asarray(selected)
+        slot = first_slot + int(np.sum(np.asarray(is_training_view)[first_slot:]))
+        view_ids = np.arange(slot, slot + len(selected), dtype=np.int32)
+        if view_ids[-1] >= len(is_training_view):
+            raise ValueError(
+                f"{scene.name}: {len(is_training_view) - slot} empty views left for "
+                f"{len(selected)} pictures; make room for more with with_empty_views"
+            )
+        chosen = take(candidates.cameras, selected)
+        return _write_views(table, view_ids, chosen, capture_fn(chosen)), view_ids
+
+    return CandidateSource(propose, acquire)
+
+
+def scene_hemisphere(key, scene: Scene, num: int) -> np.ndarray:
+    """Poses on the hemisphere around a scene, as far away as its cameras are in the median."""
+    positions = np.asarray(scene.cameras.positions)[np.asarray(scene.pool)]
+    radius = float(np.median(np.linalg.norm(positions - scene.centre, axis=-1)))
+    return hemisphere_poses(key, num, centre=scene.centre, radius=radius, up=scene.up)
+
+
+def with_empty_views(table: PixelTable, num: int) -> PixelTable:
+    """A pixel table with room for `num` more pictures, sized like its first view.
+
+    The new views are blank and stand where the first one does until a picture is written.
+    """
+    first = int(table.offsets[1])
+    cameras = jax.tree.map(
+        lambda x: jnp.concatenate([x, jnp.repeat(x[:1], num, axis=0)]), table.cameras
+    )
+    blank = jnp.zeros((num * first, 3), jnp.uint8)
+    mask = table.pixel_mask
+    if mask.shape[0] > 1:
+        mask = jnp.concatenate([mask, jnp.ones(num * first, bool)])
+    more = table.offsets[-1] + first * jnp.arange(1, num + 1)
+    return PixelTable(
+        cameras=cameras,
+        pixels=jnp.concatenate([table.pixels, blank]),
+        pixel_mask=mask,
+        offsets=jnp.concatenate([table.offsets, more]),
+    )
+
+
+def _write_views(table: PixelTable, view_ids, cameras: Cameras, pixels) -> PixelTable:
+    """Puts pictures and their cameras into views of the same size."""
+    starts, ends = np.asarray(table.offsets)[view_ids], np.asarray(table.offsets)[view_ids + 1]
+    rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, ends)])
+    merged = jax.tree.map(lambda old, new: old.at[view_ids].set(new), table.cameras, cameras)
+    return table.replace(cameras=merged, pixels=table.pixels.at[rows].set(pixels))
+

@@ -1,0 +1,134 @@
+"""How close a rendered image is to the true one: PSNR and SSIM, on 8-bit values.
+
+Images are [..., H, W, 3] sRGB in [0, 1]; every measure keeps the leading axes, so that a stack of
+test views gives one number per view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+SSIM_TAPS = 11  # pixels, the window of Wang et al. 2004
+SSIM_SIGMA = 1.5  # pixels
+SSIM_K1, SSIM_K2 = 0.01, 0.03
+
+
+def quantise_uint8(image: jax.Array) -> jax.Array:
+    """What is left of an image once it is saved with 8 bits: `round(255 clip(image, 0, 1)) / 255`.
+
+    Published numbers are measured on saved files (nerfbaselines' protocol), hence also these.
+
+    Args:
+      image: [...] sRGB, nominally in [0, 1].
+
+    Returns:
+      [...] float32, multiples of 1/255 in [0, 1].
+    """
+    return jnp.round(255.0 * jnp.clip(image, 0.0, 1.0)) / 255.0
+
+
+def psnr(prediction: jax.Array, truth: jax.Array) -> jax.Array:
+    """Peak signal-to-noise ratio for a data range of 1: `-10 log10(mean (prediction - truth)^2)`.
+
+    Args:
+      prediction: [..., H, W, 3] in [0, 1].
+      truth: [..., H, W, 3] in [0, 1].
+
+    Returns:
+      [...] dB; infinite where the two are identical.
+
+    Raises:
+      ValueError: the shapes differ or are not those of images.
+    """
+    _check_images(prediction, truth)
+    mse = jnp.mean(jnp.square(prediction - truth), axis=(-3, -2, -1))
+    return -10.0 * jnp.log10(mse)
+
+
+def ssim(prediction: jax.Array, truth: jax.Array) -> jax.Array:
+    """Structural similarity (Wang et al. 2004): agreement of local mean, contrast and structure.
+
+    `(2 mx my + C1) (2 vxy + C2) / ((mx^2 + my^2 + C1) (vxx + vyy + C2))` with the means `m` and
+    (co)variances `v` under an 11 x 11 Gaussian window of sigma 1.5 pixels, `C1 = 0.01^2`,
+    `C2 = 0.03^2`; averaged over channels and over the pixels whose window lies inside of the image.
+
+    Args:
+      prediction: [..., H, W, 3] in [0, 1].
+      truth: [..., H, W, 3] in [0, 1].
+
+    Returns:
+      [...] in [-1, 1]; 1 where the two are identical.
+
+    Raises:
+      ValueError: the shapes differ, or a side is shorter than the window.
+
+    *Numerics*: (co)variances do not change when a constant is taken off, and `E[x^2] - E[x]^2`
+    cancels least near 0, so they are computed about mid-grey.
+    """
+    _check_images(prediction, truth)
+    if min(truth.shape[-3:-1]) < SSIM_TAPS:
+        raise ValueError(
+            f"image: {truth.shape[-2]} x {truth.shape[-3]} pixels are fewer than SSIM's window of "
+            f"{SSIM_TAPS} x {SSIM_TAPS}; measure larger images"
+        )
+    c1, c2 = SSIM_K1**2, SSIM_K2**2
+    x, y = prediction - 0.5, truth - 0.5
+    mean_x, mean_y = _window_mean(x), _window_mean(y)
+    var_x = _window_mean(x * x) - mean_x**2
+    var_y = _window_mean(y * y) - mean_y**2
+    cov_xy = _window_mean(x * y) - mean_x * mean_y
+    mean_x, mean_y = mean_x + 0.5, mean_y + 0.5
+    luminance = (2.0 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
+    structure = (2.0 * cov_xy + c2) / (var_x + var_y + c2)
+    return jnp.mean(luminance * structure, axis=(-3, -2, -1))
+
+
+def measure_images(
+    prediction: jax.Array, truth: jax.Array, *, lpips_fn: Callable | None = None
+) -> dict[str, jax.Array | None]:
+    """All image measures by the 8-bit protocol: both images are quantised, then compared.
+
+    Args:
+      prediction: [..., H, W, 3] sRGB as rendered.
+      truth: [..., H, W, 3] sRGB in [0, 1].
+      lpips_fn: from `perceptual.make_lpips_fn`, or None where it is not installed.
+
+    Returns:
+      `psnr` [...] dB, `ssim` [...], and `lpips` [...], None without `lpips_fn`.
+
+    Raises:
+      ValueError: as `ssim`.
+    """
+    prediction, truth = quantise_uint8(prediction), quantise_uint8(truth)
+    return {
+        "psnr": psnr(prediction, truth),
+        "ssim": ssim(prediction, truth),
+        "lpips": None if lpips_fn is None else lpips_fn(prediction, truth),
+    }
+
+
+def _check_images(prediction: jax.Array, truth: jax.Array) -> None:
+    if prediction.shape != truth.shape or truth.ndim < 3 or truth.shape[-1] != 3:
+        raise ValueError(
+            f"image: prediction {prediction.shape} and truth {truth.shape} must both be "
+            "[..., H, W, 3]"
+        )
+
+
+def _window_mean(image: jax.Array) -> jax.Array:
+    """Gaussian-weighted mean over each whole window, [..., H - 10, W - 10, 3]."""
+    offsets = np.arange(SSIM_TAPS) - SSIM_TAPS // 2
+    weights = np.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
+    weights = weights / weights.sum()
+    # Two passes of shifted sums: a convolution would lose digits to TF32 on some accelerators.
+    for axis in (-3, -2):
+        length = image.shape[axis] - SSIM_TAPS + 1
+        image = sum(
+            float(weight) * jax.lax.slice_in_dim(image, i, i + length, axis=axis)
+            for i, weight in enumerate(weights)
+        )
+    return image

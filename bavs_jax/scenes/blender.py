@@ -1,0 +1,134 @@
+"""Scenes in the layout of NeRF-synthetic: `transforms_{train,test}.json` and RGBA images."""
+
+from __future__ import annotations
+
+import math
+import pathlib
+
+import numpy as np
+
+from bavs_jax.cameras import make_cameras
+from bavs_jax.scenes import checks, images
+from bavs_jax.scenes.base import Scene, SceneError, pixel_table
+
+BOX_HALF_SIDE = 1.5  # scene units; the objects of this data set fit into it
+NEAR, FAR = 2.0, 6.0  # scene units
+DEPTH_RANGE = 8.0  # scene units that the 8 bits of a depth image span
+
+
+def find_depth(image_path: pathlib.Path) -> pathlib.Path | None:
+    """The depth image `<name>_depth*.png` that lies beside an image, or None."""
+    return min(image_path.parent.glob(f"{image_path.stem}_depth*.png"), default=None)
+
+
+def decode_depth(values: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """Distance along the ray from an 8-bit depth image: `8 (1 - v / 255)`, 0 where unknown.
+
+    Args:
+      values: [H, W] uint8, 0 for the background.
+      alpha: [H, W] uint8 opacity of the colour image.
+
+    Returns:
+      [H, W] float32, scene units.
+    """
+    depth = DEPTH_RANGE * (1.0 - values.astype(np.float32) / 255.0)
+    return np.where((values > 0) & (alpha > 0), depth, np.float32(0.0))
+
+
+def load_depth(image_path: pathlib.Path, image: np.ndarray, size) -> np.ndarray | None:
+    """One view's depth [H, W] at `size` (width, height), or None where it has no file."""
+    path = find_depth(image_path)
+    if path is None:
+        return None
+    values = images.read_image(path)[..., 0]
+    checks.check_image_size(
+        values.shape[::-1], (image.shape[1], image.shape[0]), path, image_path.name
+    )
+    alpha = image[..., 3] if image.shape[-1] == 4 else np.full_like(values, 255)
+    return images.nearest_resize(decode_depth(values, alpha), *size)
+
+
+def load_split(root: pathlib.Path, split: str, *, image_size, background, strict: bool) -> dict:
+    """Loads one `transforms_<split>.json`: a dict of lists with one entry per view."""
+    path = root / f"transforms_{split}.json"
+    data = checks.read_json(path)
+    frames = checks.check_frames(data, path)
+    angle = checks.check_number(data.get("camera_angle_x"), path, "camera_angle_x", positive=True)
+    if angle >= math.pi:
+        raise SceneError(f"{path}: camera_angle_x: is {angle}: give radians below pi")
+    files = [images.find_image(root, frame["file_path"]) for frame in frames]
+    kept = checks.keep_existing(frames, files, path, strict=strict)
+
+    views = {"poses": [], "intrinsics": [], "images": [], "depths": [], "names": []}
+    original = None
+    for index in kept:
+        field = f"frames[{index}].transform_matrix"
+        views["poses"].append(checks.check_pose(frames[index].get("transform_matrix"), path, field))
+        image = images.read_image(files[index])
+        height, width = image.shape[:2]
+        original = original or (width, height)
+        checks.check_image_size((width, height), original, files[index], "the split's first image")
+
+        new_width = checks.check_target_width(image_size, width, files[index])
+        size = (new_width, max(round(height * new_width / width), 1))
+        views["images"].append(images.shrink_over(image, *size, background))
+        views["depths"].append(load_depth(files[index], image, size))
+        focal = 0.5 * width / math.tan(0.5 * angle)  # pixels are square in the original
+        views["intrinsics"].append(
+            [focal * size[0] / width, focal * size[1] / height, 0.5 * size[0], 0.5 * size[1]]
+        )
+        views["names"].append(checks.view_name(files[index], root))
+    return views
+
+
+def load_blender(
+    root, *, image_size: int | None = None, background=(1.0, 1.0, 1.0), strict: bool = False
+) -> Scene:
+    """Loads a scene in the layout of NeRF-synthetic.
+
+    `transforms_train.json` gives the pool, `transforms_test.json` the test views. Where
+    `<image>_depth*.png` exists it is read as the true depth.
+
+    Args:
+      root: the scene's folder.
+      image_size: wanted width in pixels, at most the original; the height keeps the proportion.
+      background: [3] sRGB in [0, 1] to put under transparent pixels.
+      strict: an image without a file is an error, not a warning.
+
+    Returns:
+      The scene, in the file's own coordinates.
+
+    Raises:
+      SceneError: anything in the files that cannot be used.
+    """
+    root = pathlib.Path(root).expanduser()
+    options = {"image_size": image_size, "background": background, "strict": strict}
+    train = load_split(root, "train", **options)
+    test = load_split(root, "test", **options)
+    views = {name: train[name] + test[name] for name in train}
+    num_train, num_views = len(train["names"]), len(views["names"])
+
+    pixels, offsets = pixel_table(views["images"])
+    depth = None
+    if any(d is not None for d in views["depths"]):
+        unknown = (np.zeros(im.shape[:2], np.float32) for im in views["images"])
+        depth, _ = pixel_table([u if d is None else d for d, u in zip(views["depths"], unknown)])
+    box = np.array([[-BOX_HALF_SIDE] * 3, [BOX_HALF_SIDE] * 3], np.float32)
+    return Scene(
+        name=root.resolve().name,
+        cameras=make_cameras(
+            views["poses"],
+            views["intrinsics"],
+            [(im.shape[1], im.shape[0]) for im in views["images"]],
+        ),
+        pixels=pixels,
+        offsets=offsets,
+        pool=np.arange(num_train, dtype=np.int32),
+        test=np.arange(num_train, num_views, dtype=np.int32),
+        box=box,
+        near=NEAR,
+        far=FAR,
+        background=np.asarray(background, np.float32),
+        names=tuple(views["names"]),
+        depth=depth,
+    )

@@ -1,0 +1,144 @@
+"""Checks on input files; every fault is a `SceneError` that names file, field and fix."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import pathlib
+import warnings
+
+import numpy as np
+
+from bavs_jax.scenes.base import SceneError
+
+# Poses written with six digits pass; a scaled or sheared rotation does not.
+ORTHONORMAL_TOLERANCE = 1e-3
+NAMES_IN_WARNING = 3
+
+
+def read_json(path: pathlib.Path) -> dict:
+    """Reads a JSON file whose top level is an object."""
+    if not path.is_file():
+        raise SceneError(f"{path}: file is missing: check the scene's folder")
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path}: not UTF-8 text ({error.reason}): save it as UTF-8") from error
+    except json.JSONDecodeError as error:
+        raise SceneError(f"{path}: line {error.lineno}: {error.msg}: mend the JSON") from error
+    if not isinstance(data, dict):
+        raise SceneError(f"{path}: top level is a {type(data).__name__}: make it an object")
+    return data
+
+
+def check_frames(data: dict, path: pathlib.Path) -> list[dict]:
+    """The `frames` of a transforms file: each an object with its own `file_path`."""
+    frames = data.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise SceneError(f"{path}: frames: missing or empty: list at least one frame")
+    seen: dict[pathlib.PurePosixPath, int] = {}
+    for index, frame in enumerate(frames):
+        name = frame.get("file_path") if isinstance(frame, dict) else None
+        if not isinstance(name, str) or not name:
+            raise SceneError(f"{path}: frames[{index}].file_path: missing: name the frame's image")
+        name = pathlib.PurePosixPath(name)
+        if name in seen:
+            raise SceneError(
+                f"{path}: frames[{index}].file_path: '{name}' is a duplicate of "
+                f"frames[{seen[name]}]: remove one"
+            )
+        seen[name] = index
+    return frames
+
+
+def check_number(value, path: pathlib.Path, field: str, *, positive: bool = False) -> float:
+    """A finite number, or with `positive` one above 0."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        what = "missing" if value is None else f"{value!r} is no number"
+        raise SceneError(f"{path}: {field}: {what}: give a number")
+    if not math.isfinite(value):
+        raise SceneError(f"{path}: {field}: is {value}: give a finite number")
+    if positive and value <= 0:
+        raise SceneError(f"{path}: {field}: is {value}: give a number above 0")
+    return float(value)
+
+
+def check_pose(value, path: pathlib.Path, field: str) -> np.ndarray:
+    """A rigid camera-to-world pose [4, 4] float64 in OpenGL axes."""
+    if value is None:
+        raise SceneError(f"{path}: {field}: missing: give a 4 x 4 camera-to-world matrix")
+    try:
+        pose = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        raise SceneError(f"{path}: {field}: not a matrix of numbers: give 4 x 4 numbers") from None
+    if pose.shape not in ((3, 4), (4, 4)):
+        raise SceneError(f"{path}: {field}: has shape {list(pose.shape)}: give a 4 x 4 matrix")
+    if not np.isfinite(pose).all():
+        raise SceneError(f"{path}: {field}: holds NaN or infinity: give finite numbers")
+    rotation = pose[:3, :3]
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if error > ORTHONORMAL_TOLERANCE:
+        raise SceneError(
+            f"{path}: {field}: rotation is not orthonormal (off by {error:.2g}): "
+            "take scale and shear out of its columns"
+        )
+    if np.linalg.det(rotation) < 0:
+        raise SceneError(f"{path}: {field}: rotation mirrors (determinant -1): flip one axis")
+    last_row = [0.0, 0.0, 0.0, 1.0]
+    if pose.shape[0] == 4 and np.abs(pose[3] - last_row).max() > ORTHONORMAL_TOLERANCE:
+        raise SceneError(f"{path}: {field}: last row is {pose[3].tolist()}: make it [0, 0, 0, 1]")
+    return np.concatenate([pose[:3], [last_row]])
+
+
+def check_image_size(size, expected, path: pathlib.Path, field: str) -> None:
+    """An image must have the (width, height) that `field` promises."""
+    if tuple(size) != tuple(expected):
+        raise SceneError(
+            f"{path}: image is {size[0]} x {size[1]} but {field} says "
+            f"{expected[0]} x {expected[1]}: use images of one size"
+        )
+
+
+def check_target_width(target: int | None, width: int, path: pathlib.Path) -> int:
+    """The wanted image width in pixels; None asks for the original `width`."""
+    if target is None:
+        return width
+    if target < 1 or target > width:
+        raise SceneError(f"{path}: image_size {target} is outside of 1 to {width}: choose within")
+    return target
+
+
+def view_name(file: pathlib.Path, root: pathlib.Path) -> str:
+    """A view's name: its file relative to the scene's folder, with forward slashes."""
+    return pathlib.PurePath(os.path.relpath(file, root)).as_posix()
+
+
+def keep_existing(frames: list, files: list, path: pathlib.Path, *, strict: bool) -> list[int]:
+    """Indices of the frames whose image exists; one warning counts and names the others.
+
+    Args:
+      frames: the frames of a transforms file.
+      files: the image file of each frame, or None where there is none.
+      path: the transforms file, for messages.
+      strict: missing images are an error rather than a warning.
+
+    Returns:
+      Indices into `frames`, in their order.
+
+    Raises:
+      SceneError: images are missing under `strict`, or none is left.
+    """
+    kept = [index for index, file in enumerate(files) if file is not None]
+    missing = [frame["file_path"] for frame, file in zip(frames, files) if file is None]
+    if not missing:
+        return kept
+    names = ", ".join(missing[:NAMES_IN_WARNING])
+    names += ", ..." if len(missing) > NAMES_IN_WARNING else ""
+    fault = f"{path}: file_path: {len(missing)} of {len(frames)} images have no file ({names})"
+    if strict:
+        raise SceneError(f"{fault}: add them or load without strict")
+    if not kept:
+        raise SceneError(f"{fault}: the split is empty: add the images")
+    warnings.warn(f"{fault}: skipped", stacklevel=3)
+    return kept

@@ -1,0 +1,286 @@
+"""A scene made on the spot: photographs and exact depth of the sculpture from any pose."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import pathlib
+import tempfile
+import warnings
+import zipfile
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bavs_jax.cameras import Cameras, hemisphere_poses, make_cameras, pixel_rays, take
+from bavs_jax.scenes import sculpture, sdf
+from bavs_jax.scenes.base import Scene, SceneError
+
+SOURCE_VERSION = 2  # raise it when the look of the scene changes: caches are then made anew
+CAMERA_RADIUS = 3.2  # scene units
+FIELD_OF_VIEW = 0.64  # radians across the width; holds the whole object from every side
+BACKGROUND = (1.0, 1.0, 1.0)
+SUBSAMPLES = 3  # per pixel and axis
+CONE_CHUNK = 1 << 14  # pixels per call; a last chunk that is not full costs as much
+RAY_CHUNK = 1 << 11  # pixels per call, each with SUBSAMPLES**2 rays
+COLOUR_TOLERANCE = 3e-4  # scene units
+COLOUR_BISECTIONS = 6
+DEPTH_MIN_STEP = 1e-3  # scene units
+
+
+def subpixel_offsets() -> np.ndarray:
+    """Centres of an even grid within a pixel, relative to its centre, [SUBSAMPLES**2, 2]."""
+    steps = (np.arange(SUBSAMPLES) + 0.5) / SUBSAMPLES - 0.5
+    return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2).astype(np.float32)
+
+
+def components(vectors: jax.Array) -> sdf.Point:
+    """Components of [..., 3]."""
+    return tuple(vectors[..., i] for i in range(3))
+
+
+def ball_interval(
+    origins: sdf.Point, directions: sdf.Point, spread: jax.Array | float = 0.0
+) -> tuple[jax.Array, jax.Array]:
+    """Distances at which rays, or cones of some spread, enter and leave the object's ball.
+
+    Both are 0 for rays that pass it by.
+    """
+    middle = -sum(o * d for o, d in zip(origins, directions))
+    radius = sculpture.SCENE_RADIUS + spread * (middle + sculpture.SCENE_RADIUS)
+    half2 = radius**2 - sum(o * o for o in origins) + middle**2
+    half = jnp.sqrt(jnp.maximum(half2, 0.0))
+    meets = (half2 > 0.0) & (middle + half > 0.0)
+    return (
+        jnp.where(meets, jnp.maximum(middle - half, 0.0), 0.0),
+        jnp.where(meets, middle + half, 0.0),
+    )
+
+
+def pixel_cones(cameras: Cameras, pixels: jax.Array):
+    """The ray through each pixel's centre and a bound on how far its other rays spread from it.
+
+    Returns:
+      `(origins, directions, spread)`: components [N], and distance per unit of distance [N].
+    """
+    view_ids = jnp.arange(len(cameras))
+    rays = pixel_rays(cameras, view_ids, pixels)
+    offsets = subpixel_offsets()
+    apart = [
+        jnp.linalg.norm(
+            pixel_rays(cameras, view_ids, pixels + offsets[corner]).directions - rays.directions,
+            axis=-1,
+        )
+        for corner in (0, SUBSAMPLES - 1)  # both diagonals; the other ends mirror them
+    ]
+    spread = 1.05 * jnp.max(jnp.stack(apart), axis=0)
+    return components(rays.origins), components(rays.directions), spread
+
+
+def first_touch(cameras: Cameras, pixels: jax.Array):
+    """Where the cone of each pixel may first touch the object: `(t, touches, spread)`, all [N]."""
+    origins, directions, spread = pixel_cones(cameras, pixels)
+    enter, leave = ball_interval(origins, directions, spread)
+    _, t, touches = sdf.march(
+        sculpture.distance, origins, directions, enter, leave, spread=spread, tolerance=2e-3
+    )
+    return t, touches, spread
+
+
+def photograph(cameras: Cameras, pixels: jax.Array, t_start: jax.Array, spread: jax.Array):
+    """Red, green, blue [N] in [0, 1], each the mean over a pixel, and depth [N] at its centre."""
+    offsets = subpixel_offsets()
+    num, sub = pixels.shape[0], offsets.shape[0]
+    places = (offsets[:, None, :] + pixels[None]).reshape(-1, 2)
+    rays = pixel_rays(cameras, jnp.tile(jnp.arange(num), sub), places)
+    origins, directions = components(rays.origins), components(rays.directions)
+    _, leave = ball_interval(origins, directions)
+    # What a ray clips by less than a small part of the pixel's width hardly changes its colour.
+    t_before, t, hit = sdf.march(
+        sculpture.distance,
+        origins,
+        directions,
+        jnp.tile(t_start, sub),
+        leave,
+        tolerance=COLOUR_TOLERANCE,
+        min_step=jnp.tile(0.25 * spread * t_start, sub),
+    )
+    t = sdf.bisect(sculpture.distance, origins, directions, t_before, t, steps=COLOUR_BISECTIONS)
+    # The channels stay apart: stacked to [..., 3] here, XLA would shade once for each of them.
+    shaded = sculpture.shade(sdf.at(origins, directions, t), directions)
+    channels = [
+        jnp.where(hit, c, b).reshape(sub, num).mean(axis=0) for c, b in zip(shaded, BACKGROUND)
+    ]
+
+    middle = slice(sub // 2 * num, (sub // 2 + 1) * num)
+    origins, directions = (tuple(c[middle] for c in v) for v in (origins, directions))
+    t_before, t, hit = sdf.march(
+        sculpture.distance,
+        origins,
+        directions,
+        t_start,
+        leave[middle],
+        tolerance=0.0,
+        min_step=DEPTH_MIN_STEP,
+    )
+    depth = sdf.bisect(sculpture.distance, origins, directions, t_before, t)
+    return *channels, jnp.where(hit, depth, 0.0)
+
+
+def in_chunks(
+    fn, cameras: Cameras, view_ids: np.ndarray, arrays: list[np.ndarray], chunk: int
+) -> list[np.ndarray]:
+    """Calls `fn(cameras, *rows)` on slices of one fixed length, the last one padded.
+
+    Each row brings its own camera, so that the number of views is no shape that `fn` is compiled
+    for: the next capture, of any number of poses, compiles nothing.
+    """
+    num, outputs = len(view_ids), []
+    for start in range(0, num, chunk):
+        rows = np.minimum(np.arange(start, start + chunk), num - 1)
+        outputs.append(fn(take(cameras, view_ids[rows]), *(a[rows] for a in arrays)))
+    return [np.concatenate(parts)[:num] for parts in zip(*outputs)]
+
+
+@functools.cache
+def compiled_steps():
+    """The two passes, jitted once for all captures."""
+    return jax.jit(first_touch), jax.jit(photograph)
+
+
+def capture(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
+    """Takes pictures of the sculpture from any poses, as an active robot would.
+
+    Args:
+      cameras: V cameras with any lens, outside of the object; sizes may differ.
+
+    Returns:
+      `(pixels, depth)`: [N, 3] uint8 sRGB over white, each the mean of 3 x 3 rays, and [N] float32
+      distance along the ray through the pixel's centre, 0 where it meets nothing; rows as in
+      `Scene.pixels`.
+    """
+    touch_fn, photograph_fn = compiled_steps()
+    cameras = jax.tree.map(np.asarray, cameras)
+    sizes = cameras.sizes
+    counts = sizes.prod(axis=-1)
+    view_ids = np.repeat(np.arange(len(sizes), dtype=np.int32), counts)
+    row = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    width = np.repeat(sizes[:, 0], counts)
+    centres = np.stack([row % width + 0.5, row // width + 0.5], axis=-1).astype(np.float32)
+
+    t_start, touches, spread = in_chunks(touch_fn, cameras, view_ids, [centres], CONE_CHUNK)
+    colours = np.tile(np.float32(BACKGROUND), (len(row), 1))
+    depth = np.zeros(len(row), np.float32)
+    seen = np.flatnonzero(touches)
+    if len(seen):
+        arrays = [centres[seen], t_start[seen], spread[seen]]
+        *channels, depth[seen] = in_chunks(
+            photograph_fn, cameras, view_ids[seen], arrays, RAY_CHUNK
+        )
+        colours[seen] = np.stack(channels, axis=-1)
+    return np.rint(255.0 * colours).astype(np.uint8), depth
+
+
+def hemisphere_cameras(key: jax.Array, num: int, *, image_size: int) -> Cameras:
+    """Square cameras on the upper hemisphere around the sculpture (Eq 14)."""
+    poses = hemisphere_poses(key, num, centre=(0.0, 0.0, 0.0), radius=CAMERA_RADIUS)
+    focal = 0.5 * image_size / np.tan(0.5 * FIELD_OF_VIEW)
+    intrinsics = [[focal, focal, 0.5 * image_size, 0.5 * image_size]] * num
+    return make_cameras(poses, intrinsics, [[image_size, image_size]] * num)
+
+
+def read_cache(path: pathlib.Path, num_pixels: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Pixels and depth from a cache file; None, after a warning, where it is damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            pixels, depth = data["pixels"], data["depth"]
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        warnings.warn(f"{path}: cache is damaged ({error}): made anew", stacklevel=3)
+        return None
+    if pixels.shape != (num_pixels, 3) or depth.shape != (num_pixels,):
+        warnings.warn(f"{path}: cache has the wrong shape {pixels.shape}: made anew", stacklevel=3)
+        return None
+    return pixels, depth
+
+
+def write_cache(path: pathlib.Path, pixels: np.ndarray, depth: np.ndarray) -> None:
+    """Writes a cache file in one go: a reader sees all of it or nothing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, pixels=pixels, depth=depth)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def load_procedural(
+    *,
+    image_size: int = 100,
+    num_train: int = 100,
+    num_test: int = 25,
+    cache_dir=None,
+    seed: int = 0,
+) -> Scene:
+    """Makes the scene that comes with the project: images and exact depth of the sculpture.
+
+    Args:
+      image_size: width and height in pixels.
+      num_train: views of the pool.
+      num_test: views that are only measured; from another random key.
+      cache_dir: a folder that keeps the images for the next time, or None.
+      seed: draws the poses.
+
+    Returns:
+      The scene, with depth for all views.
+
+    Raises:
+      SceneError: a size or count below 1.
+    """
+    for field, value in (
+        ("image_size", image_size),
+        ("num_train", num_train),
+        ("num_test", num_test),
+    ):
+        if value < 1:
+            raise SceneError(f"procedural: {field}: is {value}: give at least 1")
+    key_train, key_test = jax.random.split(jax.random.key(seed))
+    train = hemisphere_cameras(key_train, num_train, image_size=image_size)
+    test = hemisphere_cameras(key_test, num_test, image_size=image_size)
+    cameras = jax.tree.map(lambda a, b: np.concatenate([a, b]), train, test)
+
+    num_views = num_train + num_test
+    cached, path = None, None
+    if cache_dir is not None:
+        arguments = [SOURCE_VERSION, image_size, num_train, num_test, seed]
+        digest = hashlib.sha256(json.dumps(arguments).encode()).hexdigest()[:16]
+        path = pathlib.Path(cache_dir).expanduser() / f"procedural-{digest}.npz"
+        cached = read_cache(path, num_views * image_size**2)
+    pixels, depth = capture(cameras) if cached is None else cached
+    if path is not None and cached is None:
+        write_cache(path, pixels, depth)
+
+    return Scene(
+        name="procedural",
+        cameras=cameras,
+        pixels=pixels,
+        offsets=np.arange(num_views + 1, dtype=np.int64) * image_size**2,
+        pool=np.arange(num_train, dtype=np.int32),
+        test=np.arange(num_train, num_views, dtype=np.int32),
+        box=np.array([[-1.0] * 3, [1.0] * 3], np.float32),
+        near=CAMERA_RADIUS - np.sqrt(3.0),  # the box's corners
+        far=CAMERA_RADIUS + np.sqrt(3.0),
+        background=np.array(BACKGROUND, np.float32),
+        names=tuple(
+            [f"train_{i:03d}" for i in range(num_train)]
+            + [f"test_{i:03d}" for i in range(num_test)]
+        ),
+        depth=depth,
+    )

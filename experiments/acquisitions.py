@@ -1,0 +1,109 @@
+"""What was offered, scored and chosen: one small file per round, and their summary.
+
+A file per round survives a kill and is simply written again when a round is chosen again.
+"""
+
+from __future__ import annotations
+
+import pathlib
+
+import jax
+import numpy as np
+
+from bavs_jax.cameras import Cameras, take
+from bavs_jax.scenes.poses import user_transforms
+from experiments.files import write_arrays, write_json
+
+CAMERA_FIELDS = ("world_from_cam", "intrinsics", "distortion", "sizes")
+
+
+def save_choice(folder: pathlib.Path, number: int, choice, *, in_scene: bool) -> None:
+    """Writes round `number`'s choice.
+
+    Args:
+      folder: the run's folder.
+      number: 1 for the first batch that was chosen.
+      choice: an `active.Choice`.
+      in_scene: whether candidates are views of the scene, or poses drawn freely.
+    """
+    cameras = choice.candidates.cameras
+    picked = jax.tree.map(np.asarray, take(cameras, choice.selected))
+    write_arrays(
+        _choice_path(folder, number),
+        positions=np.asarray(cameras.positions),
+        candidate_ids=choice.candidates.view_ids if in_scene else np.full(len(cameras), -1),
+        scores=choice.selection.scores,
+        survivors=choice.selection.survivors,
+        selected=choice.selected,
+        selected_scores=choice.selection.selected_scores,
+        nearest_training_distance=choice.selection.nearest_training_distance,
+        **{name: getattr(picked, name) for name in CAMERA_FIELDS},
+    )
+
+
+def load_choices(folder: pathlib.Path, num_rounds: int) -> list[dict[str, np.ndarray]]:
+    """The choices of rounds 1 .. num_rounds."""
+    choices = []
+    for number in range(1, num_rounds + 1):
+        with np.load(_choice_path(folder, number)) as data:
+            choices.append(dict(data))
+    return choices
+
+
+def acquisition_arrays(scene, initial, choices: list[dict]) -> dict[str, np.ndarray]:
+    """The arrays of `acquisition.npz`: all rounds over one numbering of views.
+
+    The scene's views come first; candidates that are not views of the scene follow.
+    """
+    positions = [np.asarray(scene.cameras.positions)]
+    numbering = []
+    for choice in choices:
+        ids = choice["candidate_ids"]
+        if ids[0] < 0:
+            ids = sum(map(len, positions)) + np.arange(len(ids))
+            positions.append(choice["positions"])
+        numbering.append(ids)
+    num = sum(map(len, positions))
+    scores = np.full((len(choices), num), np.nan, np.float32)
+    survivors = np.zeros((len(choices), num), bool)
+    for row, (ids, choice) in enumerate(zip(numbering, choices)):
+        scores[row, ids] = choice["scores"]
+        survivors[row, ids] = choice["survivors"]
+    selected = [ids[choice["selected"]] for ids, choice in zip(numbering, choices)]
+    return {
+        "positions": np.concatenate(positions),
+        "up": np.asarray(scene.up, np.float32),
+        "centre": scene.centre,
+        "pool": np.asarray(scene.pool),
+        "scores": scores,
+        "survivors": survivors,
+        "selected": np.array(selected, np.int32).reshape(len(choices), -1),
+        "initial": np.asarray(initial),
+    }
+
+
+def write_next_views(path: pathlib.Path, scene, choices: list[dict]) -> None:
+    """Writes the chosen poses as a nerfstudio `transforms.json`, in the user's coordinates.
+
+    Frames come in the order of choosing; `round`, `rank` and `score` say when and why.
+    """
+    frames = []
+    for number, choice in enumerate(choices, start=1):
+        cameras = Cameras(**{name: choice[name] for name in CAMERA_FIELDS})
+        poses = user_transforms(scene, cameras.world_from_cam)
+        for rank, index in enumerate(choice["selected"]):
+            view_id = int(choice["candidate_ids"][index])
+            fx, fy, cx, cy = (float(x) for x in cameras.intrinsics[rank])
+            width, height = (int(n) for n in cameras.sizes[rank])
+            name = scene.names[view_id] if view_id >= 0 else f"next/{number}_{rank + 1}.png"
+            frame = {"file_path": name, "transform_matrix": poses[rank].tolist()}
+            frame |= {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": width, "h": height}
+            frame |= zip(("k1", "k2", "k3", "k4", "p1", "p2"), cameras.distortion[rank].tolist())
+            score = float(choice["selected_scores"][rank])
+            frames.append(frame | {"round": number, "rank": rank + 1, "score": score})
+    lens = {"pinhole": "OPENCV", "opencv": "OPENCV"}[scene.cameras.lens]
+    write_json(path, {"camera_model": lens, "frames": frames})
+
+
+def _choice_path(folder: pathlib.Path, number: int) -> pathlib.Path:
+    return folder / "choices" / f"round_{number}.npz"

@@ -1,0 +1,78 @@
+"""Trains a field on few views, chooses the next ones by several policies, and compares them.
+
+    python -m experiments.active_selection \\
+        --config=experiments/configs/quickstart.py --workdir=runs/quickstart
+
+Any option of the config can be given as a flag, such as --config.seeds='(0,1,2)'. A run that was
+stopped goes on when it is started again with the same --workdir.
+"""
+
+from __future__ import annotations
+
+import pathlib
+import sys
+import time
+
+from absl import app, flags
+from ml_collections import config_flags
+
+from bavs_jax.scenes import SceneError
+from bavs_jax.selection.context import SelectionError
+from bavs_jax.selection.policies import POLICIES, get_policy
+from experiments import runtime, workdir
+from experiments.build import build_problem, load_config_scene
+from experiments.report import write_report
+from experiments.runner import Run
+
+FLAGS = flags.FLAGS
+config_flags.DEFINE_config_file(
+    "config",
+    "experiments/configs/quickstart.py",
+    "What to run; every option is explained in experiments/configs/base.py.",
+    lock_config=True,
+)
+flags.DEFINE_string("workdir", None, "Folder for results, checkpoints and report.html.")
+flags.DEFINE_bool("list_policies", False, "Print the known acquisition policies and stop.")
+flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
+
+
+def run_all(config, folder: pathlib.Path, command: str) -> None:
+    """All policies and seeds of a config, then the summary, the exported views and the report."""
+    for policy in config.policies:
+        get_policy(policy)
+    folder.mkdir(parents=True, exist_ok=True)
+    workdir.claim(folder, config)
+    start = time.monotonic()
+    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    print(f"{scene.name}: {len(scene.pool)} views to choose from, {len(scene.test)} test views")
+    problem = build_problem(config, scene)
+    for seed in config.seeds:
+        shared = Run(config, problem, folder, None, seed)
+        shared.finish()
+        for policy in config.policies:
+            Run(config, problem, folder, policy, seed).finish(shared)
+            workdir.collect(folder, command)
+    next_views = workdir.export_next_views(folder, config.policies[0], config.seeds[0])
+    report = write_report(folder)
+    print(f"chosen poses: {next_views}")
+    print(f"report:       {report}  ({time.monotonic() - start:.0f} s in all)")
+
+
+def main(argv) -> None:
+    if len(argv) > 1:
+        raise app.UsageError(f"unknown argument {argv[1]!r}; options are given as --name=value")
+    if FLAGS.list_policies:
+        print("\n".join(POLICIES))
+        return
+    if not FLAGS.workdir:
+        raise app.UsageError("--workdir: is missing; name a folder for the results")
+    if FLAGS.compilation_cache:
+        runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
+    try:
+        run_all(FLAGS.config, pathlib.Path(FLAGS.workdir), runtime.command_line())
+    except (SceneError, SelectionError, workdir.WorkdirError, KeyError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    app.run(main)

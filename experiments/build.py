@@ -1,0 +1,262 @@
+"""From a config to the parts of a run. The only reader of configs."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bavs_jax import active
+from bavs_jax.candidates import (
+    CandidateSource,
+    captured_candidates,
+    dataset_candidates,
+    with_empty_views,
+)
+from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.fields.hash_grid import make_hash_grid_field
+from bavs_jax.metrics.perceptual import make_lpips_fn
+from bavs_jax.rendering.sampling import make_march_options
+from bavs_jax.scenes import Scene, SceneError, load_scene
+from bavs_jax.scenes.procedural import capture
+from bavs_jax.selection.distances import Radii
+from bavs_jax.selection.policies import get_policy
+from bavs_jax.training.batches import PixelTable, make_pixel_table
+from bavs_jax.training.train import (
+    TrainState,
+    init_train_state,
+    make_optimiser,
+    make_train_fn,
+)
+from bavs_jax.uncertainty.channel import vertex_variance
+from bavs_jax.uncertainty.posterior import default_prior_weight
+from bavs_jax.uncertainty.scoring import make_render_chunk_fn, mean_uncertainty
+from bavs_jax.uncertainty.streaming import make_curvature_fn
+
+RENDER_CHUNK = 8192  # rays of one compiled rendering call
+
+
+class Problem(NamedTuple):
+    """One scene with everything that is compiled for it; shared by all policies and seeds."""
+
+    scene: Scene
+    table: PixelTable
+    init_train: Callable  # key -> TrainState
+    make_step: Callable  # (policy name, initial views, track, label) -> an active step
+    render: Callable  # (TrainState, jac_sq_sum, num_rays) -> (Rays [chunk] -> dict)
+    curvature: Callable  # (TrainState, table, view_ids, within, progress_fn) -> jac_sq_sum
+    lpips_fn: Callable | None
+    lpips_reason: str | None
+    calls_per_round: int
+    num_vertices: int
+    has_empty_views: bool  # whether the table has room for pictures taken on the way
+    first_empty_row: int  # of the pixel table
+
+
+def load_config_scene(config, *, cache_dir: str | None) -> Scene:
+    """The scene that a config names, from its `data_dir` or from $BAVS_DATA.
+
+    Raises:
+      SceneError: neither is given, or the scene's files cannot be used.
+    """
+    if config.loader == "procedural":
+        return load_scene("procedural", image_size=config.image_size, cache_dir=cache_dir)
+    folder = config.data_dir
+    if not folder:
+        if not os.environ.get("BAVS_DATA"):
+            raise SceneError(
+                "config.data_dir: is empty and BAVS_DATA is not set: "
+                "pass --config.data_dir=FOLDER_OF_SCENES"
+            )
+        folder = os.path.join(os.environ["BAVS_DATA"], config.loader)
+    root = os.path.join(folder, config.scene)
+    return load_scene(config.loader, root=root, image_size=config.image_size)
+
+
+def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:
+    """Which views a run starts with: a function of seed and scene alone, never of the policy."""
+    if not 1 <= num <= len(scene.pool):
+        raise SceneError(
+            f"{scene.name}: num_initial is {num}, but the pool has {len(scene.pool)} views: "
+            "give a number between 1 and that"
+        )
+    return np.random.default_rng(seed).permutation(np.asarray(scene.pool))[:num]
+
+
+def build_problem(config, scene: Scene) -> Problem:
+    """Puts fields, renderer, training, curvature and selection together."""
+    field = make_hash_grid_field(scene.box, **config.field)
+    march = config.march
+    march_options = make_march_options(
+        scene.box,
+        near=scene.near,
+        far=scene.far,
+        num_steps=march.num_steps,
+        num_slots=march.num_slots,
+    )
+    train = config.train
+    optimiser, schedule = make_optimiser(
+        learning_rate=train.learning_rate,
+        final_share=train.final_share,
+        num_steps=train.num_steps,
+    )
+    train_call = make_train_fn(
+        field,
+        optimiser,
+        schedule,
+        march_options,
+        background=scene.background,
+        num_rays=train.num_rays,
+        capacity=train.capacity,
+        steps_per_call=train.steps_per_call,
+    )
+    init_train = partial(
+        init_train_state,
+        field=field,
+        optimiser=optimiser,
+        box=scene.box,
+        occupancy_resolution=march.occupancy_resolution,
+    )
+
+    options = config.uncertainty
+    grid = DeformationGrid(jnp.asarray(scene.box), options.log2_cells)
+    prior_weight = options.prior_weight or default_prior_weight(options.log2_cells)
+    curvature_fn = make_curvature_fn(
+        field, grid, march_options, background=scene.background, weighting=options.weighting
+    )
+    render_chunk = make_render_chunk_fn(
+        field,
+        grid,
+        march_options,
+        background=jnp.asarray(scene.background),
+        capacity=2 * RENDER_CHUNK,
+        variant=options.variant,
+        scale=options.scale,
+    )
+
+    def curvature(state: TrainState, table, view_ids, within, progress_fn=None):
+        return curvature_fn(
+            state.params, state.occupancy, table, view_ids, within, progress_fn=progress_fn
+        )
+
+    def render(state: TrainState, jac_sq_sum, num_rays: int):
+        variance = vertex_variance(
+            jac_sq_sum,
+            num_rays=num_rays,
+            prior_weight=prior_weight,
+            weighting=options.weighting,
+            variant=options.variant,
+        )
+        return partial(render_chunk, state.params, state.occupancy, variance)
+
+    def restart(key, state: TrainState) -> TrainState:
+        fresh = init_train(key)
+        if config.from_scratch:
+            return fresh
+        return fresh.replace(params=state.params, occupancy=state.occupancy)
+
+    table = make_pixel_table(scene)
+    source, table = _make_source(config, scene, table)
+    calls_per_round = -(-train.num_steps // train.steps_per_call)
+    lpips_fn, lpips_reason = (None, "switched off: config.lpips_net is empty")
+    if config.lpips_net:
+        lpips_fn, lpips_reason = make_lpips_fn(config.lpips_net)
+
+    def make_step(policy_name: str, initial, track: Callable, label: str):
+        num_rays = _count_pixels(scene, initial)
+
+        def make_score_fn(state, jac_sq_sum, cameras):
+            chunk_fn = render(state, jac_sq_sum, num_rays)
+
+            def score(indices):
+                scale = config.candidates.image_scale
+                with track(len(indices), f"{label}: score candidates", "views") as task:
+                    return mean_uncertainty(
+                        chunk_fn,
+                        cameras,
+                        indices,
+                        image_scale=scale,
+                        chunk=RENDER_CHUNK,
+                        progress_fn=task.advance,
+                    )
+
+            return score
+
+        def tracked_curvature(state, table, view_ids, within):
+            with track(len(view_ids), f"{label}: curvature", "rays") as task:
+                return curvature(state, table, view_ids, within, progress_fn=task.advance)
+
+        stages = active.Stages(train_call, restart, tracked_curvature, make_score_fn)
+        return active.make_active_step(
+            get_policy(policy_name),
+            stages,
+            source,
+            centre=scene.centre,
+            batch_size=config.batch_size,
+            calls_per_round=calls_per_round,
+            max_curvature_rays=options.max_rays or None,
+            radii=_radii(config),
+            mode=config.candidates.mode or None,
+        )
+
+    return Problem(
+        scene=scene,
+        table=table,
+        init_train=init_train,
+        make_step=make_step,
+        render=render,
+        curvature=curvature,
+        lpips_fn=lpips_fn,
+        lpips_reason=lpips_reason,
+        calls_per_round=calls_per_round,
+        num_vertices=grid.num_vertices,
+        has_empty_views=len(table.cameras) > scene.num_views,
+        first_empty_row=int(scene.offsets[-1]),
+    )
+
+
+def _count_pixels(scene: Scene, view_ids) -> int:
+    return int(np.diff(scene.offsets)[np.asarray(view_ids)].sum())
+
+
+def _radii(config) -> Radii | None:
+    given = (config.candidates.min_train_distance, config.candidates.min_candidate_distance)
+    if given == (0.0, 0.0):
+        return None
+    if 0.0 in given:
+        raise ValueError(
+            "config.candidates: give both min_train_distance and min_candidate_distance, or neither"
+        )
+    return Radii(*given)
+
+
+def _make_source(config, scene: Scene, table: PixelTable) -> tuple[CandidateSource, PixelTable]:
+    options = config.candidates
+    if options.source == "dataset":
+        return dataset_candidates(scene), table
+    if options.source != "hemisphere":
+        raise ValueError(
+            f"config.candidates.source: {options.source!r} is unknown; use dataset or hemisphere"
+        )
+    draws = options.hemisphere_draws
+    if config.loader != "procedural":
+        return dataset_candidates(scene, hemisphere_draws=draws), table
+    first_slot = len(table.cameras)
+    table = with_empty_views(table, config.num_rounds * config.batch_size)
+    source = captured_candidates(
+        scene,
+        lambda cameras: capture(cameras)[0],
+        num_candidates=draws,
+        first_slot=first_slot,
+    )
+    return source, table
+
+
+def run_key(seed: int) -> jax.Array:
+    """The key from which all of a run's randomness comes."""
+    return jax.random.key(seed)

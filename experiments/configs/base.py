@@ -1,0 +1,72 @@
+"""Every option of an active-selection run, with its default and what it means."""
+
+from ml_collections import ConfigDict
+
+
+def get_config() -> ConfigDict:
+    config = ConfigDict()
+
+    # --- the scene ---
+    config.loader = "procedural"  # a key of bavs_jax.scenes.LOADERS
+    config.data_dir = ""  # folder of scenes; empty: $BAVS_DATA/<loader>
+    config.scene = "sculpture"  # folder in data_dir (the procedural scene has just this one)
+    config.image_size = 100  # pixels of the image width
+
+    # --- the experiment ---
+    config.policies = ("bavs", "random")  # see --list_policies; the first one's views are exported
+    config.seeds = (0,)
+    config.num_initial = 4  # views, drawn from the pool by seed and scene alone
+    config.batch_size = 4  # views chosen at once
+    config.num_rounds = 2  # batches after the initial views; 1 is the paper's single iteration
+    config.from_scratch = True  # train anew in each round, or train on
+    config.num_test = 25  # test views between rounds, evenly spaced in the test split; 0: all
+    config.num_test_final = 0  # test views after the last round; 0: all
+    config.num_pictures = 4  # test views shown in the report
+    config.lpips_net = "alex"  # "alex", "vgg" or "" for none; needs bavs_jax[lpips]
+    config.checkpoint_seconds = 30.0  # at most this much work is lost when a run is killed
+
+    # --- the field (fields/hash_grid.py) ---
+    config.field = ConfigDict()
+    config.field.num_levels = 8
+    config.field.coarsest = 16  # cells per side of the coarsest level
+    config.field.finest = 128
+    config.field.features = 2  # per vertex
+    config.field.log2_table_size = 16
+    config.field.width = 64
+    config.field.geometry_features = 15
+    config.field.direction_degree = 2  # spherical-harmonics bands, 1 .. 4
+
+    # --- rays (rendering/sampling.py) ---
+    config.march = ConfigDict()
+    config.march.num_steps = 192  # steps through the diagonal of the scene box
+    config.march.num_slots = 64  # most samples of a ray
+    config.march.occupancy_resolution = 64
+
+    # --- training (training/train.py) ---
+    config.train = ConfigDict()
+    config.train.num_steps = 1600  # optimiser steps of each round
+    config.train.num_rays = 2048
+    config.train.capacity = 16384  # samples evaluated in one step
+    config.train.learning_rate = 1e-2
+    config.train.final_share = 0.1  # of the learning rate, at the end of a round
+    config.train.steps_per_call = 16  # compiled together
+
+    # --- uncertainty (bavs_jax/uncertainty) ---
+    config.uncertainty = ConfigDict()
+    config.uncertainty.log2_cells = 6  # L: a grid of 2^L cells per side
+    config.uncertainty.prior_weight = 0.0  # lambda; 0: 1e-4 / (2^L)^3
+    config.uncertainty.weighting = "eq13"  # "eq13", "eq11" or "empirical"
+    config.uncertainty.variant = "posterior"  # "posterior" or "bayesrays"
+    config.uncertainty.scale = "log"  # "log": log10 sigma on [0, 1]; "sigma"
+    config.uncertainty.max_rays = 0  # training rays in the curvature; 0: all
+
+    # --- candidates (bavs_jax/candidates.py, bavs_jax/selection) ---
+    config.candidates = ConfigDict()
+    config.candidates.source = "dataset"  # "dataset" or "hemisphere" (Eq 14)
+    config.candidates.hemisphere_draws = 100
+    config.candidates.image_scale = 0.25  # of width and height, for the score (Eq 15)
+    config.candidates.mode = ""  # "top_k", "greedy" or "" for the policy's own
+    config.candidates.min_train_distance = 0.0  # scene units; 0: 0.2 x median camera distance
+    config.candidates.min_candidate_distance = 0.0
+
+    return config

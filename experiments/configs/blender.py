@@ -1,0 +1,13 @@
+"""A NeRF-synthetic scene at laptop size: 4 views growing to 20, as in the paper's Table 1."""
+
+from experiments.configs import base
+
+
+def get_config():
+    config = base.get_config()
+    config.loader = "blender"
+    config.scene = "lego"
+    config.image_size = 100
+    config.num_rounds = 4
+    config.train.num_steps = 1600
+    return config

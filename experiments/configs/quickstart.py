@@ -1,0 +1,9 @@
+"""A few minutes on a laptop: the scene that comes with the project, 4 views growing to 12."""
+
+from experiments.configs import base
+
+
+def get_config():
+    config = base.get_config()
+    config.train.num_steps = 1200
+    return config

@@ -1,0 +1,75 @@
+"""Measures a field on test views."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bavs_jax.metrics.depth import depth_mae
+from bavs_jax.metrics.image import measure_images
+from bavs_jax.rendering.images import render_views
+from experiments.build import RENDER_CHUNK
+
+
+def spread_evenly(view_ids, num: int) -> np.ndarray:
+    """`num` of the views, evenly spaced in their order; all of them if `num` is 0."""
+    view_ids = np.asarray(view_ids)
+    if num == 0 or num >= len(view_ids):
+        return view_ids
+    return view_ids[np.arange(num) * len(view_ids) // num]
+
+
+def evaluate_views(render_fn, scene, view_ids, *, lpips_fn=None, progress_fn=None) -> dict:
+    """Mean image measures over views by the 8-bit protocol, and the mean depth error.
+
+    Args:
+      render_fn: `Rays` [chunk] -> dict with "rgb" and "depth".
+      scene: the scene with the true images.
+      view_ids: [n] which views.
+      lpips_fn: see `measure_images`.
+      progress_fn: called with the number of rays done.
+
+    Returns:
+      dict of `psnr` (dB), `ssim`, `lpips`, `depth_mae` (scene units), `num_test_views` and
+      `thinned` (share of rays sampled more coarsely than asked for); null where not measured.
+    """
+    images = render_views(
+        lambda rays: {k: render_fn(rays)[k] for k in ("rgb", "depth", "thinned")},
+        scene.cameras,
+        view_ids,
+        chunk=RENDER_CHUNK,
+        progress_fn=progress_fn,
+    )
+    rows = []
+    for view_id, image in zip(view_ids, images):
+        truth = scene.image(view_id).astype(np.float32) / 255.0
+        row = measure_images(image["rgb"], truth, lpips_fn=lpips_fn)
+        if scene.depth is not None:
+            row["depth_mae"] = depth_mae(image["depth"], scene.depth_image(view_id))
+        rows.append({k: float(v) for k, v in row.items() if v is not None})
+    means = {k: _mean([row.get(k) for row in rows]) for k in ("psnr", "ssim", "lpips", "depth_mae")}
+    thinned = float(np.mean([image["thinned"].mean() for image in images]))
+    return {**means, "thinned": thinned, "num_test_views": len(rows)}
+
+
+def _mean(values) -> float | None:
+    """Mean of the values that exist and are numbers: views without depth have no depth error."""
+    known = [value for value in values if value is not None and not math.isnan(value)]
+    return float(np.mean(known)) if known else None
+
+
+def picture_arrays(render_fn, scene, view_ids) -> dict[str, np.ndarray]:
+    """Truth, render, error, uncertainty and depth of some views, for the report."""
+    images = render_views(render_fn, scene.cameras, view_ids, chunk=RENDER_CHUNK)
+    truth = np.stack([scene.image(v) for v in view_ids])
+    rgb = np.stack([np.clip(image["rgb"], 0.0, 1.0) for image in images])
+    return {
+        "view_ids": np.asarray(view_ids),
+        "names": np.array([scene.names[v] for v in view_ids]),
+        "truth": truth,
+        "rgb": np.round(255.0 * rgb).astype(np.uint8),
+        "error": np.abs(rgb - truth / 255.0).mean(-1).astype(np.float32),
+        "uncertainty": np.stack([image["uncertainty"] for image in images]),
+        "depth": np.stack([image["depth"] for image in images]),
+    }

@@ -1,0 +1,202 @@
+"""Curves and bars as inline SVG, drawn with matplotlib's objects and no global state."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import matplotlib
+from matplotlib import patheffects
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, MaxNLocator
+
+from experiments.report import stats
+from experiments.report.results import Run
+
+# Okabe and Ito 2008: told apart by colour-blind readers. Yellow is left out, too pale on white.
+BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
+POLICY_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
+POLICY_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+PARTS = {
+    "train": ("training", BLUE),
+    "curvature": ("curvature", ORANGE),
+    "score": ("scoring candidates", GREEN),
+    "select": ("selecting", PURPLE),
+    "evaluate": ("measuring on test views", SKY),
+}
+GREY = "#6b7280"
+
+
+def to_svg(figure: Figure, *, salt: str, label: str) -> str:
+    """A figure as an `<svg>` element that may stand in a page beside others.
+
+    Args:
+      figure: what to draw.
+      salt: makes the ids of this element differ from those of the other ones.
+      label: what it shows, for readers who do not see it.
+    """
+    buffer = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": salt, "svg.fonttype": "path"}):
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
+    svg = buffer.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    # The group names of matplotlib are the same in every figure, but ids must be unique on a page.
+    svg = re.sub(r'<g id="[^"]*_\d+">', "<g>", svg)
+    # Glyphs are defined per figure; a viewer that looks one up by id may find another figure's.
+    svg = re.sub(r"(id=\"|href=\"#|url\(#)", rf"\g<1>{salt}-", svg)
+    return svg.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
+
+
+def tidy(axes: Axes) -> None:
+    """Takes away what carries no information."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color("#9ca3af")
+    axes.tick_params(colors="#374151", labelsize=9)
+    axes.set_axisbelow(True)
+
+
+def policy_style(policies: list[str]) -> dict[str, tuple[str, str]]:
+    """Policy -> (colour, marker), the same in every figure of the page."""
+    return {
+        policy: (
+            POLICY_COLOURS[i % len(POLICY_COLOURS)],
+            # Shifted by one per lap, so that no pair comes twice for 49 policies.
+            POLICY_MARKERS[(i + i // len(POLICY_COLOURS)) % len(POLICY_MARKERS)],
+        )
+        for i, policy in enumerate(policies)
+    }
+
+
+def quality_plot(runs: list[Run], policies: list[str], measure: stats.Measure) -> str | None:
+    """One measure against the number of training views, or None if no run has it."""
+    style = policy_style(policies)
+    figure = Figure(figsize=(5.4, 3.7), layout="constrained")
+    axes = figure.add_subplot()
+    ends = []  # (last number of views, last value, policy) for the labels
+    numbers = set()
+    for policy in policies:
+        colour, marker = style[policy]
+        mine = [run for run in runs if run.policy == policy]
+        for run in mine:
+            points = _points(run, measure.key)
+            if not points:
+                continue
+            numbers.update(n for n, _ in points)
+            single = {"linewidth": 0.8, "alpha": 0.45}
+            if not run.completed:
+                single = {"linewidth": 1.6, "linestyle": ":", "marker": marker, "markersize": 3.5}
+            axes.plot(*zip(*points), color=colour, zorder=2, **single)
+        curve = stats.mean_curve(runs, policy, measure.key)
+        if curve:
+            x, means = [n for n, _ in curve], [i.mean for _, i in curve]
+            halves = [i.half or 0.0 for _, i in curve]
+            if any(halves):
+                low = [m - h for m, h in zip(means, halves)]
+                high = [m + h for m, h in zip(means, halves)]
+                axes.fill_between(x, low, high, color=colour, alpha=0.14, linewidth=0, zorder=1)
+            axes.plot(
+                *(x, means),
+                color=colour,
+                marker=marker,
+                markersize=5.5,
+                markeredgecolor="white",
+                markeredgewidth=0.7,
+                linewidth=2.0,
+                zorder=3,
+            )
+            ends.append((x[-1], means[-1], policy))
+        elif any(points := _points(run, measure.key) for run in mine):
+            ends.append((*points[-1], f"{policy} (incomplete)"))
+    if not numbers:
+        return None
+    axes.set_xlabel("training views", fontsize=10, color="#374151")
+    axes.set_title(measure.title, fontsize=10.5, loc="left", color="#111827")
+    axes.grid(axis="y", color="#e5e7eb", linewidth=0.8)
+    axes.yaxis.set_major_locator(MaxNLocator(6))
+    axes.xaxis.set_major_locator(
+        FixedLocator(sorted(numbers)) if len(numbers) <= 10 else MaxNLocator(8, integer=True)
+    )
+    tidy(axes)
+    _label_ends(axes, ends, {**style, **{f"{p} (incomplete)": s for p, s in style.items()}})
+    return to_svg(
+        figure, salt=f"quality-{measure.key}", label=f"{measure.label} against training views"
+    )
+
+
+def _points(run: Run, measure: str) -> list[tuple[int, float]]:
+    pairs = [(r["num_views"], run.value(measure, r["num_views"])) for r in run.rounds]
+    return [(n, value) for n, value in pairs if value is not None]
+
+
+def _label_ends(axes: Axes, ends: list, style: dict) -> None:
+    """Writes each policy's name beside the end of its line, moved apart where they would touch."""
+    low, high = axes.get_ylim()
+    gap = 0.065 * (high - low)
+    lowest = {}  # by number of views, where there is room for the next name
+    for x, y, policy in sorted(ends, key=lambda end: end[1]):
+        y_text = max(y, lowest.get(x, y))
+        lowest[x] = y_text + gap
+        text = axes.annotate(
+            policy,
+            xy=(x, y),
+            xytext=(9, (y_text - y) / (high - low) * 200),  # 200 points: about the axes' height
+            textcoords="offset points",
+            color=style[policy][0],
+            fontsize=9.5,
+            fontweight="bold",
+            va="center",
+            annotation_clip=False,
+            zorder=5,
+        )
+        text.set_path_effects([patheffects.withStroke(linewidth=3, foreground="white")])
+    axes.set_ylim(low, high)
+
+
+def timing_plot(runs: list[Run], policies: list[str]) -> str | None:
+    """Where the time went, a stacked bar per policy, or None if nothing has been completed."""
+    rows = [p for p in policies if stats.completed(runs, p)]
+    if not rows:
+        return None
+    figure = Figure(figsize=(10.6, 1.15 + 0.42 * len(rows)), layout="constrained")
+    axes = figure.add_subplot()
+    left = [0.0] * len(rows)
+    for part, (label, colour) in PARTS.items():
+        widths = [stats.mean_seconds(runs, policy, part) for policy in rows]
+        axes.barh(
+            *(range(len(rows)), widths),
+            left=left,
+            height=0.62,
+            color=colour,
+            edgecolor="white",
+            linewidth=0.8,
+            label=label,
+        )
+        left = [a + b for a, b in zip(left, widths)]
+    for row, total in enumerate(left):
+        axes.annotate(
+            f" {seconds(total)}", xy=(total, row), va="center", fontsize=9.5, color="#111827"
+        )
+    axes.set_yticks(range(len(rows)), rows)
+    axes.invert_yaxis()
+    axes.set_xlim(0.0, max(1.12 * max(left), 1e-3))
+    axes.set_xlabel("seconds for all rounds of one run, mean over seeds", fontsize=10)
+    tidy(axes)
+    axes.grid(axis="x", color="#e5e7eb", linewidth=0.8)
+    figure.legend(
+        loc="outside upper left", ncols=len(PARTS), frameon=False, fontsize=9, handlelength=1.2
+    )
+    return to_svg(figure, salt="timings", label="Seconds spent per policy and part of the work")
+
+
+def seconds(value: float) -> str:
+    """A duration in words: `0.42 s`, `12.3 s`, `3 min 20 s`."""
+    if value < 9.995:
+        return f"{value:.2f} s"
+    if value < 119.95:
+        return f"{value:.1f} s"
+    minutes, rest = divmod(round(value), 60)
+    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{value / 3600:.2f} h"

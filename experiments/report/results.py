@@ -1,0 +1,103 @@
+"""The files of a working folder, read and checked: `summary.json` and the arrays of each run."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+
+SCHEMA_VERSION = 1
+PICTURE_KEYS = ("view_ids", "names", "truth", "rgb", "error", "uncertainty", "round")
+ACQUISITION_KEYS = (
+    *("positions", "up", "centre", "pool"),
+    *("scores", "survivors", "selected", "initial"),
+)
+RUN_KEYS = ("scene", "policy", "seed", "rounds", "completed")
+
+
+class ReportError(ValueError):
+    """A file that cannot be used: one line that names the file, the field and the fix."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One policy with one seed."""
+
+    policy: str
+    seed: int
+    completed: bool
+    rounds: list[dict]  # as in result.json, round 0 first
+    result: dict  # the whole of result.json
+    folder: Path  # where its pictures.npz and acquisition.npz are, if it has them
+
+    def value(self, measure: str, num_views: int) -> float | None:
+        """A measure at the last round with so many views; None if not measured or not finite."""
+        values = [r.get(measure) for r in self.rounds if r["num_views"] == num_views]
+        if not values or values[-1] is None or not np.isfinite(values[-1]):
+            return None
+        return float(values[-1])
+
+    @property
+    def label(self) -> str:
+        return f"{self.policy}, seed {self.seed}"
+
+
+def load_runs(workdir: Path) -> list[Run]:
+    """All runs of `summary.json`, in its order.
+
+    Raises:
+      ReportError: the file is missing or broken, or holds runs of more than one scene.
+    """
+    path = workdir / "summary.json"
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ReportError(f"{path}: no such file; give the --workdir of an experiment") from None
+    except json.JSONDecodeError as error:
+        raise ReportError(f"{path}: not JSON ({error}); run the experiment again") from None
+    if summary.get("schema_version") != SCHEMA_VERSION:
+        raise ReportError(
+            f"{path}: schema_version is {summary.get('schema_version')}, this program reads "
+            f"{SCHEMA_VERSION}; run the experiment again"
+        )
+    runs = [_load_run(result, path) for result in summary["runs"]]
+    scenes = sorted({run.result["scene"]["name"] for run in runs})
+    if len(scenes) > 1:
+        raise ReportError(f"{path}: scene differs ({', '.join(scenes)}); use one workdir per scene")
+    return runs
+
+
+def _load_run(result: dict, path: Path) -> Run:
+    missing = [key for key in RUN_KEYS if key not in result]
+    if missing:
+        raise ReportError(f"{path}: a run lacks {', '.join(missing)}; run the experiment again")
+    return Run(
+        policy=result["policy"],
+        seed=int(result["seed"]),
+        completed=bool(result["completed"]),
+        rounds=result["rounds"],
+        result=result,
+        folder=path.parent / result["policy"] / f"seed_{result['seed']}",
+    )
+
+
+def load_pictures(run: Run) -> dict[str, np.ndarray] | None:
+    """Test images of a run, or None if it has none (yet)."""
+    return _load_arrays(run.folder / "pictures.npz", PICTURE_KEYS)
+
+
+def load_acquisition(run: Run) -> dict[str, np.ndarray] | None:
+    """Cameras, scores and choices of a run, or None if it has none (yet)."""
+    return _load_arrays(run.folder / "acquisition.npz", ACQUISITION_KEYS)
+
+
+def _load_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray] | None:
+    if not path.exists():
+        return None
+    with np.load(path, allow_pickle=False) as file:
+        missing = [key for key in keys if key not in file]
+        if missing:
+            raise ReportError(f"{path}: lacks {', '.join(missing)}; run the experiment again")
+        return {key: file[key] for key in file.files}

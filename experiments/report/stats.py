@@ -1,0 +1,143 @@
+"""Means, intervals and paired gaps over seeds. Only completed runs count."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+from scipy.stats import t as student_t
+
+from experiments.report.results import Run
+
+
+@dataclasses.dataclass(frozen=True)
+class Measure:
+    """How a measure is called and printed."""
+
+    key: str
+    label: str
+    unit: str  # empty where it has none
+    digits: int
+    better: str  # "higher" or "lower"
+
+    @property
+    def title(self) -> str:
+        unit = f" ({self.unit})" if self.unit else ""
+        return f"{self.label}{unit}, {self.better} is better"
+
+
+MEASURES = (
+    Measure("psnr", "PSNR", "dB", 2, "higher"),
+    Measure("ssim", "SSIM", "", 4, "higher"),
+    Measure("lpips", "LPIPS", "", 4, "lower"),
+    Measure("depth_mae", "Depth error", "scene units", 4, "lower"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Interval:
+    """A mean over seeds with its 95 % interval, `mean ± half`."""
+
+    mean: float
+    half: float | None  # None: one seed says nothing about the spread
+    num: int
+
+    @property
+    def low(self) -> float | None:
+        return None if self.half is None else self.mean - self.half
+
+    @property
+    def high(self) -> float | None:
+        return None if self.half is None else self.mean + self.half
+
+
+def mean_interval(values) -> Interval | None:
+    """Mean and Student's t interval: `half = t_{0.975, n - 1} s / sqrt(n)`.
+
+    Args:
+      values: one number per seed, or paired differences, one per seed.
+
+    Returns:
+      The interval, or None of no values.
+    """
+    values = np.asarray(list(values), np.float64)
+    if values.size == 0:
+        return None
+    half = None
+    if values.size > 1:
+        half = student_t.ppf(0.975, values.size - 1) * values.std(ddof=1) / np.sqrt(values.size)
+    return Interval(float(values.mean()), None if half is None else float(half), values.size)
+
+
+def completed(runs: list[Run], policy: str | None = None) -> list[Run]:
+    """Runs that ended and measured something, of one policy or of all."""
+    return [r for r in runs if r.completed and r.rounds and policy in (None, r.policy)]
+
+
+def common_num_views(runs: list[Run]) -> int | None:
+    """The largest number of views that every completed run has been measured at."""
+    sets = [{r["num_views"] for r in run.rounds} for run in completed(runs)]
+    common = set.intersection(*sets) if sets else set()
+    return max(common) if common else None
+
+
+def over_seeds(runs: list[Run], policy: str, measure: str, num_views: int) -> Interval | None:
+    """Mean over the seeds of a policy."""
+    values = [run.value(measure, num_views) for run in completed(runs, policy)]
+    return mean_interval(v for v in values if v is not None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """One policy against another over the seeds both have."""
+
+    policy: Interval
+    reference: Interval
+    gap: Interval  # of the paired differences, policy - reference
+
+
+def compare(
+    runs: list[Run], policy: str, reference: str, measure: str, num_views: int
+) -> Comparison | None:
+    """Pairs the seeds of two policies: the initial views, and so their luck, are the same.
+
+    Returns:
+      The comparison, or None where no seed has both.
+    """
+    by_seed = [
+        {run.seed: run.value(measure, num_views) for run in completed(runs, name)}
+        for name in (policy, reference)
+    ]
+    pairs = [(value, by_seed[1].get(seed)) for seed, value in by_seed[0].items()]
+    pairs = [(a, b) for a, b in pairs if a is not None and b is not None]
+    if not pairs:
+        return None
+    ours, theirs = zip(*pairs)
+    return Comparison(
+        mean_interval(ours), mean_interval(theirs), mean_interval(a - b for a, b in pairs)
+    )
+
+
+def mean_curve(runs: list[Run], policy: str, measure: str) -> list[tuple[int, Interval]]:
+    """(number of views, interval over seeds) of a policy, few views first."""
+    numbers = sorted({r["num_views"] for run in completed(runs, policy) for r in run.rounds})
+    curve = [(n, over_seeds(runs, policy, measure, n)) for n in numbers]
+    return [(n, interval) for n, interval in curve if interval is not None]
+
+
+def views_to_reach(curve: list[tuple[int, Interval]], target: float) -> float | None:
+    """Number of views at which a mean curve first reaches `target`, linear in between."""
+    for (n0, a), (n1, b) in itertools.pairwise(curve):
+        if a.mean < target <= b.mean:
+            return n0 + (n1 - n0) * (target - a.mean) / (b.mean - a.mean)
+    return None
+
+
+def mean_seconds(runs: list[Run], policy: str, part: str) -> float | None:
+    """Seconds of one part of the work, summed over rounds, mean over completed runs."""
+    totals = [
+        sum(r.get("seconds", {}).get(part) or 0.0 for r in run.rounds)
+        for run in completed(runs, policy)
+    ]
+    return float(np.mean(totals)) if totals else None

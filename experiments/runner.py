@@ -1,0 +1,273 @@
+"""One run: a policy with a seed, from its last checkpoint to its result file."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import os
+import pathlib
+import platform
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bavs_jax.active import ActiveState, Choice, init_active_state
+from bavs_jax.training.checkpoints import Checkpoints
+from bavs_jax.uncertainty.streaming import training_pixels
+from experiments import acquisitions
+from experiments.build import Problem, initial_views, run_key
+from experiments.evaluate import evaluate_views, picture_arrays, spread_evenly
+from experiments.files import append_line, write_arrays, write_json
+from experiments.progress import track
+
+SCHEMA_VERSION = 1
+PACKAGES = ("bavs_jax", "jax", "jaxlib", "flax", "optax", "numpy")
+LOG_EVERY = 10  # training calls between two lines of metrics.jsonl
+
+
+class Run:
+    """Drives the active step for one policy and seed, and keeps the run's files up to date.
+
+    Round 0 is the same for all policies of a seed: it is made once, in `initial/seed_<n>`, by a
+    `Run` whose policy is None.
+    """
+
+    def __init__(self, config, problem: Problem, workdir: pathlib.Path, policy, seed: int):
+        self.config, self.problem, self.workdir = config, problem, workdir
+        self.policy, self.seed = policy, seed
+        self.label = f"{policy or 'initial'} seed {seed}"
+        self.folder = workdir / (policy or "initial") / f"seed_{seed}"
+        self.initial = initial_views(problem.scene, seed, config.num_initial)
+        self.rounds: list[dict] = []  # of result.json
+        self.pending = _new_pending()  # what is known of the round under way
+        self.checkpoints = Checkpoints(self.folder / "checkpoints")
+
+    def finish(self, shared: Run | None = None) -> None:
+        """Goes on from the last checkpoint to the last round and writes all files of the run.
+
+        Args:
+          shared: the finished run of round 0 to start from; None to make round 0 here.
+        """
+        state = self._start(shared)
+        step = self.problem.make_step(
+            self.policy or self.config.policies[0], self.initial, track, self.label
+        )
+        last_round = self.config.num_rounds if self.policy else 0
+        while True:
+            if self._is_trained(state) and len(self.rounds) == int(state.round):
+                self._measure_round(state, is_last=int(state.round) == last_round)
+                if self.policy:
+                    self._write_files(state, completed=int(state.round) == last_round)
+            if self._is_trained(state) and int(state.round) >= last_round:
+                break
+            state = self._one_step(step, state)
+        self.checkpoints.close()
+
+    # --- one round ---
+
+    def _is_trained(self, state: ActiveState) -> bool:
+        return int(state.calls) >= self.problem.calls_per_round
+
+    def _one_step(self, step, state: ActiveState) -> ActiveState:
+        """Runs the active step with a bar, a log and checkpoints."""
+        calls_per_round = self.problem.calls_per_round
+        steps = self.config.train.steps_per_call
+        with contextlib.ExitStack() as stack:
+            bar, clock, saved = None, time.monotonic(), time.monotonic()
+
+            def open_bar(state):
+                nonlocal bar, clock
+                left = (calls_per_round - int(state.calls)) * steps
+                label = f"{self.label}: train on {int(state.is_training_view.sum())} views"
+                bar, clock = stack.enter_context(track(left, label, "steps")), time.monotonic()
+
+            def on_choice(state, choice):
+                self._record_choice(int(state.round), choice)
+                open_bar(state)
+
+            def on_call(state, info):
+                nonlocal clock, saved
+                jax.block_until_ready(info)
+                self.pending["seconds"]["train"] += time.monotonic() - clock
+                numbers = {"loss": float(info.loss), "psnr": float(-10 * jnp.log10(info.loss))}
+                bar.advance(steps, **numbers)
+                calls = int(state.calls)
+                if calls % LOG_EVERY == 0 or calls == calls_per_round:
+                    shape = {k: float(getattr(info, k)) for k in ("rays", "samples", "thinned")}
+                    at = {"round": int(state.round), "step": calls * steps}
+                    self._log(event="train", **at, **numbers, **shape)
+                due = time.monotonic() - saved > self.config.checkpoint_seconds
+                if due or calls == calls_per_round:
+                    self._save(state)
+                    saved = time.monotonic()
+                clock = time.monotonic()
+
+            if not self._is_trained(state):
+                open_bar(state)
+            state, _ = step(run_key(self.seed), state, on_choice, on_call)
+        return state
+
+    def _record_choice(self, number: int, choice: Choice) -> None:
+        in_scene = not self.problem.has_empty_views
+        acquisitions.save_choice(self.folder, number, choice, in_scene=in_scene)
+        info = choice.selection
+        self.pending = _new_pending()
+        self.pending["seconds"] |= choice.seconds
+        self.pending |= {
+            "selected": choice.view_ids.tolist(),
+            "num_candidates": int(choice.candidates.mask.sum()),
+            "num_survivors": int(info.survivors.sum()) if info.filter else None,
+            "farthest_overlap": int(info.farthest_overlap),
+            "survivors_farthest_overlap": (
+                int(info.survivors_farthest_overlap) if info.filter else None
+            ),
+        }
+        self._log(event="choice", round=number, **self.pending)
+
+    def _measure_round(self, state: ActiveState, *, is_last: bool) -> None:
+        config, scene = self.config, self.problem.scene
+        start = time.monotonic()
+        num = config.num_test_final if is_last else config.num_test
+        view_ids = spread_evenly(scene.test, num)
+        num_pixels = int(sum(np.diff(scene.offsets)[view_ids]))
+        with track(num_pixels, f"{self.label}: {len(view_ids)} test views", "rays") as bar:
+            measures = evaluate_views(
+                self._render_fn(state, with_uncertainty=False),
+                scene,
+                view_ids,
+                lpips_fn=self.problem.lpips_fn,
+                progress_fn=bar.advance,
+            )
+        pending = self.pending
+        if int(state.round) == 0:
+            pending["selected"] = self.initial.tolist()
+        pending["seconds"]["evaluate"] = time.monotonic() - start
+        row = {"num_views": int(state.is_training_view.sum()), **pending, **measures}
+        self.rounds.append(row)
+        self.pending = _new_pending()
+        self._save(state)
+        self._log(event="round", round=int(state.round), **row)
+
+    def _render_fn(self, state: ActiveState, *, with_uncertainty: bool):
+        num_rays = int(np.diff(self.problem.scene.offsets)[self.initial].sum())
+        jac_sq_sum = jnp.zeros((self.problem.num_vertices, 3))
+        if with_uncertainty:
+            view_ids, within = training_pixels(state.table, state.is_training_view)
+            with track(len(view_ids), f"{self.label}: curvature for pictures", "rays") as bar:
+                jac_sq_sum = self.problem.curvature(
+                    state.train, state.table, view_ids, within, bar.advance
+                )
+        return self.problem.render(state.train, jac_sq_sum, num_rays)
+
+    # --- files ---
+
+    def _start(self, shared: Run | None) -> ActiveState:
+        """The last checkpoint's state, or the one where `shared` ended, or a fresh one."""
+        init_key = jax.random.fold_in(run_key(self.seed), 2**31 - 1)
+        fresh = init_active_state(
+            self.problem.init_train(init_key), self.problem.table, self.initial
+        )
+        for run in (self, shared):
+            if run is not None and run.checkpoints.latest() is not None:
+                saved, meta = run.checkpoints.restore(_saved_part(self.problem, fresh))
+                self.rounds, self.pending = meta["rounds"], meta["pending"]
+                return _whole_state(self.problem, saved)
+        return fresh
+
+    def _save(self, state: ActiveState) -> None:
+        """Writes a checkpoint; its number grows with rounds, calls and measures."""
+        calls = int(state.calls) + (len(self.rounds) > int(state.round))
+        number = int(state.round) * (self.problem.calls_per_round + 2) + calls
+        meta = {"rounds": self.rounds, "pending": self.pending}
+        self.checkpoints.save(number, _saved_part(self.problem, state), meta)
+
+    def _write_files(self, state: ActiveState, *, completed: bool) -> None:
+        scene, config = self.problem.scene, self.config
+        choices = acquisitions.load_choices(self.folder, int(state.round))
+        write_arrays(
+            self.folder / "acquisition.npz",
+            **acquisitions.acquisition_arrays(scene, self.initial, choices),
+        )
+        if completed:
+            view_ids = spread_evenly(scene.test, config.num_pictures)
+            pictures = picture_arrays(
+                self._render_fn(state, with_uncertainty=True), scene, view_ids
+            )
+            write_arrays(self.folder / "pictures.npz", **pictures, round=int(state.round))
+            path = self.folder / "next_views" / "transforms.json"
+            acquisitions.write_next_views(path, scene, choices)
+        write_json(self.folder / "result.json", self._result(completed))
+
+    def _result(self, completed: bool) -> dict:
+        scene = self.problem.scene
+        sizes = np.asarray(scene.cameras.sizes)
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "scene": {
+                "name": scene.name,
+                "kind": self.config.loader,
+                "num_pool": len(scene.pool),
+                "num_test": len(scene.test),
+                "image_size": sizes.max(axis=0).tolist(),
+            },
+            "policy": self.policy,
+            "seed": self.seed,
+            "config": self.config.to_dict(),
+            "versions": {p: importlib.metadata.version(p) for p in PACKAGES}
+            | {"python": platform.python_version()},
+            "device": _device_name(),
+            "completed": completed,
+            "lpips_reason": self.problem.lpips_reason,
+            "rounds": self.rounds,
+        }
+
+    def _log(self, **values) -> None:
+        head = {"time": time.time(), "policy": self.policy or "initial", "seed": self.seed}
+        append_line(self.workdir / "metrics.jsonl", {**head, **values})
+
+
+def _new_pending() -> dict:
+    names = ("train", "curvature", "score", "select", "evaluate")
+    return {"selected": [], "seconds": dict.fromkeys(names, 0.0)}
+
+
+def _device_name() -> str:
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        return f"{device.device_kind} x {jax.device_count()}"
+    return f"CPU, {platform.machine()}, {len(_cpu_affinity())} cores"
+
+
+def _cpu_affinity() -> set[int]:
+    return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else {*range(os.cpu_count())}
+
+
+def _saved_part(problem: Problem, state: ActiveState):
+    """The state without the scene's own pixels, which its files hold already."""
+    first = problem.first_empty_row
+    return {
+        "train": state.train,
+        "is_training_view": state.is_training_view,
+        "round": state.round,
+        "calls": state.calls,
+        "world_from_cam": state.table.cameras.world_from_cam,
+        "new_pixels": state.table.pixels[first:] if problem.has_empty_views else jnp.zeros(1),
+    }
+
+
+def _whole_state(problem: Problem, saved) -> ActiveState:
+    """The inverse of `_saved_part`."""
+    table = problem.table
+    cameras = table.cameras.replace(world_from_cam=saved["world_from_cam"])
+    pixels = table.pixels
+    if problem.has_empty_views:
+        pixels = pixels.at[problem.first_empty_row :].set(saved["new_pixels"])
+    return ActiveState(
+        train=saved["train"],
+        table=table.replace(cameras=cameras, pixels=pixels),
+        is_training_view=saved["is_training_view"],
+        round=saved["round"],
+        calls=saved["calls"],
+    )

@@ -1,0 +1,305 @@
+"""The report from files alone: its numbers, its choices, and runs that are less than complete."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+
+import numpy as np
+import pytest
+from scipy import stats as scipy_stats
+
+from experiments.report import ReportError, camera_map, choices, pictures, stats, write_report
+from experiments.report.headline import make_headline
+from experiments.report.results import load_runs
+from tests import report_files
+
+
+def _page(workdir) -> str:
+    return write_report(workdir).read_text(encoding="utf-8")
+
+
+def _words(page: str) -> str:
+    """The text of a page without its tags, with plain spaces."""
+    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", page)).split())
+
+
+def _headline(workdir, results):
+    runs = load_runs(report_files.write_workdir(workdir, results, arrays=False))
+    return make_headline(runs, list(dict.fromkeys(run.policy for run in runs)))
+
+
+@pytest.fixture(scope="module")
+def full_workdir(tmp_path_factory):
+    """Three policies with three seeds each and all arrays."""
+    results = [
+        report_files.make_result(policy, seed, num_rounds=2)
+        for policy in ("random", "farthest", "bavs")
+        for seed in range(3)
+    ]
+    return report_files.write_workdir(tmp_path_factory.mktemp("full"), results)
+
+
+@pytest.fixture(scope="module")
+def full_page(full_workdir):
+    return _page(full_workdir)
+
+
+def test_page_needs_nothing_but_itself(full_page):
+    targets = re.findall(r"""(?:src|href|url)\s*[=(]\s*["']?([^"')\s>]*)""", full_page)
+    assert len(targets) > 50
+    assert all(t.startswith(("data:image/png;base64,", "#")) for t in targets)
+    assert "<script" not in full_page
+    assert "@import" not in full_page
+
+
+def test_every_id_is_unique_and_every_reference_has_one(full_page):
+    ids = re.findall(r'\sid="([^"]+)"', full_page)
+    assert len(ids) == len(set(ids))
+    assert set(re.findall(r'href="#([^"]+)"', full_page)) <= set(ids)
+
+
+def test_page_is_deterministic(full_workdir, full_page):
+    assert _page(full_workdir) == full_page
+
+
+def test_headline_has_the_numbers_of_summary_json(full_workdir, full_page):
+    summary = json.loads((full_workdir / "summary.json").read_text())
+    final = {
+        policy: np.array(
+            [r["rounds"][-1]["psnr"] for r in summary["runs"] if r["policy"] == policy]
+        )
+        for policy in ("bavs", "random", "farthest")
+    }
+    gaps = final["bavs"] - final["random"]
+    half = scipy_stats.t.ppf(0.975, 2) * gaps.std(ddof=1) / np.sqrt(3)
+    words = _words(full_page)
+    expected = (
+        f"With 8 views, bavs reached {final['bavs'].mean():.2f} dB and random "
+        f"{final['random'].mean():.2f} dB: {gaps.mean():+.2f} dB (95 % interval "
+        f"{gaps.mean() - half:+.2f} to {gaps.mean() + half:+.2f} dB over 3 seeds)."
+    )
+    assert expected.replace("-", "−") in words
+    assert f"Against farthest ({final['farthest'].mean():.2f} dB)" in words
+
+
+def test_missing_lpips_is_a_dash_with_its_reason(full_page):
+    assert "install bavs_jax[lpips]" in _words(full_page)
+    assert not re.search(r"\b(nan|None)\b", _words(full_page))
+
+
+def test_all_sections_are_there(full_page):
+    words = _words(full_page)
+    for part in ("Quality against", "Final numbers", "Test views", "Which views", "Where the time"):
+        assert part in words
+    assert "python -m experiments.active_selection" in words
+    assert "0.10.2" in words
+    # 9 runs with 4 strips of 4 images, and 2 colour bars.
+    assert full_page.count("<img ") == 9 * 4 * 4 + 2
+    assert full_page.count("<svg ") == 3 + 9 + 1  # PSNR, SSIM and depth; maps; timings
+
+
+# --- words -----------------------------------------------------------------------------------
+
+
+def test_one_seed_is_said_to_prove_little(tmp_path):
+    headline = _headline(tmp_path, [report_files.make_result(p) for p in ("bavs", "random")])
+    assert "one seed" in headline.result
+    assert "One seed proves little" in headline.verdict
+
+
+def test_a_loss_is_called_a_loss(tmp_path):
+    results = [
+        report_files.make_result(policy, seed, gain=gain)
+        for policy, gain in (("bavs", -1.0), ("random", 0.0))
+        for seed in range(3)
+    ]
+    headline = _headline(tmp_path, results)
+    assert "−" in headline.result
+    assert "bavs lost" in headline.verdict
+    assert "excludes zero" in headline.verdict
+
+
+def test_an_interval_with_zero_is_no_clear_difference(tmp_path):
+    results = [report_files.make_result(p, s) for p in ("bavs", "random") for s in range(3)]
+    for result, gap in zip(results, [0.5, -0.4, 0.3, 0.0, 0.0, 0.0]):
+        result["rounds"][-1]["psnr"] = 25.0 + gap
+    assert "no clear difference" in _headline(tmp_path, results).verdict
+
+
+def test_views_saved_are_read_off_the_mean_curve():
+    curve = [(4, stats.Interval(20.0, None, 1)), (8, stats.Interval(24.0, None, 1))]
+    np.testing.assert_allclose(stats.views_to_reach(curve, 23.0), 7.0)
+    assert stats.views_to_reach(curve, 24.1) is None
+
+
+# --- degenerate folders ----------------------------------------------------------------------
+
+
+def test_one_policy_with_one_seed_and_no_pictures(tmp_path):
+    workdir = report_files.write_workdir(tmp_path, [report_files.make_result("bavs")], arrays=False)
+    words = _words(_page(workdir))
+    assert "Only one policy was run" in words
+    assert "has no pictures.npz yet" in words
+    assert "has no acquisition.npz yet" in words
+
+
+def test_incomplete_runs_are_named_and_left_out_of_means(tmp_path):
+    results = [report_files.make_result(p, s) for p in ("bavs", "random") for s in range(2)]
+    results[1]["completed"] = False
+    results[1]["rounds"] = results[1]["rounds"][:2]
+    workdir = report_files.write_workdir(tmp_path, results, arrays=False)
+    runs = load_runs(workdir)
+    final = stats.over_seeds(runs, "bavs", "psnr", 12)
+    assert final == stats.Interval(results[0]["rounds"][-1]["psnr"], None, 1)
+    assert stats.compare(runs, "bavs", "random", "psnr", 12).gap.num == 1
+    assert "left out of all means: bavs, seed 1." in _words(_page(workdir))
+
+
+@pytest.mark.parametrize("rounds_left", [0, 1])
+def test_runs_that_chose_nothing(tmp_path, rounds_left):
+    result = report_files.make_result("bavs", num_rounds=0, completed=False)
+    result["rounds"] = result["rounds"][:rounds_left]
+    words = _words(_page(report_files.write_workdir(tmp_path, [result])))
+    assert "There is no result yet." in words
+    assert "No view has been chosen beyond the initial ones." in words
+
+
+def test_no_run_at_all(tmp_path):
+    assert "There is no result yet." in _words(_page(report_files.write_workdir(tmp_path, [])))
+
+
+def test_null_and_nan_measures_do_not_reach_the_page(tmp_path):
+    results = [report_files.make_result(policy) for policy in ("bavs", "random")]
+    for one in results[0]["rounds"]:
+        one["psnr"], one["depth_mae"] = None, float("nan")
+    page = _page(report_files.write_workdir(tmp_path, results, arrays=False))
+    assert "bavs has no PSNR" in _words(page)
+    assert "PSNR: not measured" in _words(page)
+    assert "not a finite number" in _words(page)
+    assert not re.search(r">[^<]*\bnan\b", page)
+
+
+def test_text_from_files_is_escaped(tmp_path):
+    result = report_files.make_result("bavs", command="run --x='<script>alert(1)</script>'")
+    assert "<script>" not in _page(report_files.write_workdir(tmp_path, [result], arrays=False))
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        (None, "no such file"),
+        ("{", "not JSON"),
+        ('{"schema_version": 9, "runs": []}', "schema_version is 9"),
+        ('{"schema_version": 1, "runs": [{"policy": "bavs"}]}', "a run lacks scene"),
+    ],
+)
+def test_unusable_summary_is_named(tmp_path, content, message):
+    if content is not None:
+        (tmp_path / "summary.json").write_text(content)
+    with pytest.raises(ReportError, match=rf"summary\.json: .*{message}"):
+        write_report(tmp_path)
+
+
+def test_two_scenes_are_not_mixed(tmp_path):
+    results = [report_files.make_result("bavs", seed) for seed in range(2)]
+    results[1]["scene"] = {**results[1]["scene"], "name": "lego"}
+    with pytest.raises(ReportError, match="scene differs"):
+        write_report(report_files.write_workdir(tmp_path, results, arrays=False))
+
+
+# --- statistics, maps, pictures --------------------------------------------------------------
+
+
+def test_mean_interval_agrees_with_scipy():
+    values = np.array([24.1, 25.3, 24.7, 26.0])
+    interval = stats.mean_interval(values)
+    expected = scipy_stats.t.interval(0.95, 3, values.mean(), scipy_stats.sem(values))
+    np.testing.assert_allclose([interval.low, interval.high], expected, rtol=1e-12)
+    assert stats.mean_interval([]) is None
+
+
+def test_gap_is_paired_so_the_luck_of_a_seed_cancels(tmp_path):
+    results = [report_files.make_result(p, s) for p in ("bavs", "random") for s in range(3)]
+    for result, level in zip(results, [21.0, 25.0, 29.0, 20.0, 24.0, 28.0]):
+        result["rounds"][-1]["psnr"] = level
+    runs = load_runs(report_files.write_workdir(tmp_path, results, arrays=False))
+    gap = stats.compare(runs, "bavs", "random", "psnr", 12).gap
+    np.testing.assert_allclose([gap.mean, gap.half], [1.0, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (1, 0, 0), (1, 2, -3)])
+def test_projection_keeps_areas_and_its_landmarks(up):
+    up = np.array(up, float) / np.linalg.norm(up)
+    directions = np.random.default_rng(0).normal(size=(20000, 3))
+    points = camera_map.equal_area(directions, up)
+    # Uniform on the sphere is uniform on the disc of radius 2: a circle of radius r holds r^2 / 4.
+    inside = np.mean(np.linalg.norm(points, axis=-1) < 1.0)
+    np.testing.assert_allclose(inside, 0.25, atol=4 * np.sqrt(0.25 * 0.75 / 20000))  # 4 s.e.
+    np.testing.assert_allclose(camera_map.equal_area(3 * up[None], up), [[0, 0]], atol=1e-7)
+    horizon = np.cross(up, directions[:5])
+    radii = np.linalg.norm(camera_map.equal_area(horizon, up), axis=-1)
+    np.testing.assert_allclose(radii, np.sqrt(2.0), rtol=1e-12)
+
+
+def test_projection_is_seen_from_above():
+    up = np.array([0.0, 0.0, 1.0])
+    points = camera_map.equal_area(np.eye(3)[:2], up)  # x to the right, y to the top
+    np.testing.assert_allclose(points, np.sqrt(2.0) * np.eye(2), atol=1e-12)
+
+
+def test_rounds_replay_candidates_ranks_and_distances():
+    nan = np.nan
+    acquisition = {
+        "positions": np.array([[0, 0, 1], [3, 0, 1], [0, 4, 1], [0, 9, 1], [5, 0, 1]], float),
+        "up": np.array([0.0, 0.0, 1.0]),
+        "centre": np.zeros(3),
+        "pool": np.arange(5),
+        "initial": np.array([0]),
+        "scores": np.array([[nan, 0.9, 0.5, 0.7, 0.1], [nan, nan, nan, 0.2, 0.6]]),
+        "survivors": np.array([[1, 0, 1, 1, 1], [1, 1, 1, 1, 1]], bool),
+        "selected": np.array([[3, 2], [4, -1]]),
+    }
+    first, second = choices.make_rounds(acquisition)
+    assert [(c.view_id, c.rank, c.num_scored) for c in first.choices] == [(3, 2, 4), (2, 3, 4)]
+    assert [(c.rank_left, c.num_left) for c in first.choices] == [(1, 3), (2, 3)]
+    np.testing.assert_allclose([c.distance for c in first.choices], [9.0, 4.0])
+    assert list(second.candidates) == [1, 4]
+    assert [(c.view_id, c.rank, c.num_scored) for c in second.choices] == [(4, 1, 1)]
+    np.testing.assert_allclose(second.choices[0].distance, 5.0)  # view 1, at 2, was never held
+
+
+@pytest.mark.parametrize("capture", ["orbit of many distances", "forward facing", "in the centre"])
+def test_maps_of_captures_that_are_no_orbit(capture):
+    acquisition = report_files.make_acquisition("bavs", 0, 2)
+    rng = np.random.default_rng(3)
+    offsets = acquisition["positions"] - acquisition["centre"]
+    if capture == "orbit of many distances":
+        offsets = offsets * rng.uniform(0.5, 1.5, (len(offsets), 1))
+    elif capture == "forward facing":
+        offsets = np.array([4.0, 0.0, 0.2]) + 0.3 * rng.normal(size=offsets.shape)
+    else:
+        offsets[17] = 0.0
+    acquisition["positions"] = acquisition["centre"] + offsets
+    rounds = choices.make_rounds(acquisition)
+    svg = camera_map.map_plot(acquisition, rounds, salt="test")
+    assert svg.startswith("<svg ")
+    assert "nan" not in svg
+
+
+def test_colourise_ends_of_the_scale_and_unknown_values():
+    values = np.array([[0.0, 0.5, 2.0, np.nan]])
+    black, middle, top, unknown = pictures.colourise(values, 0.0, 1.0, "magma")[0]
+    assert tuple(black) == (0, 0, 4)  # magma's first colour
+    assert top.sum() > middle.sum() > black.sum()
+    np.testing.assert_array_equal(unknown, 153)
+
+
+def test_shrink_averages_areas_of_colours_and_of_values():
+    image = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(2, 4, 3) * 4
+    blocks = image.reshape(2, 2, 2, 3).mean(axis=(0, 2))
+    np.testing.assert_allclose(pictures.shrink(image, 2)[0], blocks, atol=0.5)  # rounded to 8 bits
+    values = np.float32([[0.0, 1.0], [2.0, 5.0]])
+    np.testing.assert_allclose(pictures.shrink(values, 1), [[2.0]])
+    assert pictures.shrink(values, 2) is values
