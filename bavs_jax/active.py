@@ -155,9 +155,7 @@ def make_active_step(
             policy, policy_key, context, batch_size, radii=radii, mode=mode
         )
         seconds["select"] = time.perf_counter() - start - seconds["score"]
-        table, view_ids = source.acquire(
-            state.table, state.is_training_view, candidates, selected
-        )
+        table, view_ids = source.acquire(state.table, state.is_training_view, candidates, selected)
         state = state.replace(
             table=table,
             is_training_view=state.is_training_view.at[view_ids].set(True),

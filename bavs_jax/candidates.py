@@ -137,4 +137,3 @@ def _write_views(table: PixelTable, view_ids, cameras: Cameras, pixels) -> Pixel
     rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, ends)])
     merged = jax.tree.map(lambda old, new: old.at[view_ids].set(new), table.cameras, cameras)
     return table.replace(cameras=merged, pixels=table.pixels.at[rows].set(pixels))
-

@@ -70,9 +70,7 @@ def trilinear_weights(grid: DeformationGrid, positions: jax.Array, vertices: jax
 def trilinear(grid: DeformationGrid, positions: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Rows [..., 8] of the vertices around each position and their weights `b` [..., 8]."""
     vertices = surrounding_vertices(grid, positions)
-    return vertex_number(grid, vertices), trilinear_weights(
-        grid, positions[..., None, :], vertices
-    )
+    return vertex_number(grid, vertices), trilinear_weights(grid, positions[..., None, :], vertices)
 
 
 def displace(grid: DeformationGrid, offsets: jax.Array, positions: jax.Array) -> jax.Array:

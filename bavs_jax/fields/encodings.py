@@ -49,9 +49,7 @@ def interpolate_level(table: jax.Array, unit_positions: jax.Array, resolution: i
     # Unrolled: one gather per corner is several times faster than one [K, 8] gather.
     for corner in range(8):
         dx, dy, dz = (corner >> 2) & 1, (corner >> 1) & 1, corner & 1
-        row = _vertex_row(
-            ix + dx, iy + dy, iz + dz, resolution=resolution, table_size=table_size
-        )
+        row = _vertex_row(ix + dx, iy + dy, iz + dz, resolution=resolution, table_size=table_size)
         weight = (
             (frac[:, 0] if dx else 1.0 - frac[:, 0])
             * (frac[:, 1] if dy else 1.0 - frac[:, 1])

@@ -28,7 +28,9 @@ def make_pixel_table(scene: Scene) -> PixelTable:
       ValueError: if the scene has more pixels than an int32 can number.
     """
     if scene.offsets[-1] >= 2**31:
-        raise ValueError(f"{scene.name}: {scene.offsets[-1]} pixels exceed 2^31; use smaller images")
+        raise ValueError(
+            f"{scene.name}: {scene.offsets[-1]} pixels exceed 2^31; use smaller images"
+        )
     mask = np.ones(1, bool) if scene.pixel_mask is None else scene.pixel_mask
     return PixelTable(
         cameras=jax.tree.map(jnp.asarray, scene.cameras),

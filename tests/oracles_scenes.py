@@ -1,0 +1,48 @@
+"""Slow references for the procedural scene, in float64."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bavs_jax.scenes import sculpture
+
+
+def distances(points: np.ndarray) -> np.ndarray:
+    """The sculpture's signed distance in float64, [...]."""
+    with jax.enable_x64(True):
+        return np.asarray(jax.jit(sculpture.signed_distance)(jnp.asarray(points, jnp.float64)))
+
+
+def brute_force_depth(
+    origins: np.ndarray, directions: np.ndarray, *, near: float, far: float, step: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """First surface along each ray, by equal small steps and then bisection.
+
+    Args:
+      origins: [R, 3].
+      directions: [R, 3] unit.
+      near: where to begin, scene units.
+      far: where to end, scene units.
+      step: what a ray clips by less may be missed, scene units.
+
+    Returns:
+      `(depth, clipped)`: [R] scene units, 0 where nothing is met, and whether a ray meets or only
+      just misses something thinner than a few steps on its way, which no marcher decides alike.
+    """
+    origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
+    t = np.arange(near, far, step)
+    values = distances(origins[:, None] + t[:, None] * directions[:, None])
+    inside = values < 0.0
+    hit, first = inside.any(axis=1), inside.argmax(axis=1)
+    before = np.arange(len(t)) < np.where(hit, first - 4, len(t))[:, None]
+    grazes = (before & (values < 2.0 * step) & (np.gradient(values, axis=1) > 0.0)).any(axis=1)
+    thin = hit & ~np.take_along_axis(inside, np.minimum(first + 4, len(t) - 1)[:, None], 1)[:, 0]
+
+    outer, inner = t[np.maximum(first - 1, 0)], t[first]
+    for _ in range(30):
+        middle = 0.5 * (outer + inner)
+        outside = distances(origins + middle[:, None] * directions) > 0.0
+        outer, inner = np.where(outside, middle, outer), np.where(outside, inner, middle)
+    return np.where(hit, inner, 0.0), grazes | thin

@@ -1,0 +1,254 @@
+"""Compositing, marching, packing and the renderer against loops and closed forms."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bavs_jax.cameras import Rays
+from bavs_jax.rendering.compositing import composite, expected_depth, render_weights
+from bavs_jax.rendering.occupancy import cell_index, init_occupancy, update_occupancy
+from bavs_jax.rendering.packing import evaluate_all_passes, evaluate_one_pass
+from bavs_jax.rendering.render import Channel, render_rays
+from bavs_jax.rendering.sampling import make_march_options, march
+from tests.oracles_rendering import march_loop, render_loop, weights_loop
+from tests.toy_fields import rays_through, smooth_field_fn
+
+BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], np.float32)
+WHITE = jnp.ones(3)
+
+
+def random_occupancy(key, share=0.3, resolution=8):
+    occupancy = init_occupancy(BOX, resolution=resolution)
+    return occupancy.replace(occupied=jax.random.uniform(key, (resolution**3,)) < share)
+
+
+def options(num_steps=48, num_slots=48):
+    return make_march_options(BOX, near=0.5, far=8.0, num_steps=num_steps, num_slots=num_slots)
+
+
+# --- compositing -----------------------------------------------------------------------------
+
+
+def test_weights_agree_with_the_recursion():
+    density = jax.random.exponential(jax.random.key(0), (5, 20)) * 10.0
+    deltas = jax.random.uniform(jax.random.key(1), (5, 20)) * 0.1
+    got = render_weights(density, deltas)
+    want = [weights_loop(s, d) for s, d in zip(density, deltas)]
+    np.testing.assert_allclose(got, want, atol=1e-6)  # float32 against float64
+
+
+def test_homogeneous_fog_has_its_closed_form():
+    """Constant sigma over a length L: opacity 1 - exp(-sigma L), however it is cut up."""
+    for num in (1, 7, 100):
+        weights = render_weights(jnp.full(num, 0.7), jnp.full(num, 2.0 / num))
+        np.testing.assert_allclose(weights.sum(), 1.0 - np.exp(-1.4), rtol=1e-5)
+
+
+@pytest.mark.parametrize("density", [0.0, 1e-12, 1e5])
+def test_weights_and_gradients_are_finite_at_extremes(density):
+    def loss(sigma):
+        weights = render_weights(sigma, jnp.full(8, 0.1))
+        return expected_depth(weights, jnp.arange(8.0)) + weights.sum()
+
+    value, grad = jax.value_and_grad(loss)(jnp.full(8, density))
+    assert np.isfinite(value) and np.isfinite(grad).all()
+
+
+def test_empty_ray_shows_the_background_and_depth_zero():
+    weights = render_weights(jnp.zeros(6), jnp.ones(6))
+    np.testing.assert_array_equal(composite(weights, jnp.ones((6, 3)) * 0.3, WHITE), WHITE)
+    assert expected_depth(weights, jnp.ones(6)) == 0.0
+
+
+# --- marching --------------------------------------------------------------------------------
+
+
+def test_march_agrees_with_a_loop():
+    occupancy = random_occupancy(jax.random.key(0))
+    rays = rays_through(jax.random.key(1), 40)
+    opts = options()
+    samples = march(rays, occupancy, opts)
+    grid = np.asarray(occupancy.occupied).reshape(8, 8, 8)
+    differing = 0
+    for ray in range(40):
+        want = march_loop(
+            rays.origins[ray], rays.directions[ray], grid, BOX, 0.5, 8.0, opts.step_size, 48
+        )
+        got = samples.t_mids[ray][samples.sample_mask[ray]]
+        if len(got) != len(want):  # a sample within rounding of a cell's face
+            differing += 1
+            continue
+        np.testing.assert_allclose(got, want, atol=1e-5)
+    assert differing <= 2
+
+
+def test_valid_slots_come_first_and_cover_what_is_occupied():
+    occupancy = random_occupancy(jax.random.key(2), share=0.7)
+    rays = rays_through(jax.random.key(3), 50)
+    full = march(rays, occupancy, options())
+    thin = march(rays, occupancy, options(num_slots=8))
+    for samples in (full, thin):
+        mask = np.asarray(samples.sample_mask)
+        assert (np.diff(mask.astype(int), axis=1) <= 0).all()
+        assert (np.asarray(samples.deltas)[~mask] == 0).all()
+    assert not full.thinned.any() and thin.thinned.any()
+    # A thinned ray still stands for (nearly) its whole way: at most one stride more.
+    length, thin_length = full.deltas.sum(-1), thin.deltas.sum(-1)
+    stride = thin.deltas.max(-1)
+    assert (thin_length >= length - 1e-5).all() and (thin_length <= length + stride).all()
+
+
+def test_rays_that_miss_the_box_have_no_samples():
+    rays = Rays(jnp.array([[3.0, 0.0, 0.0], [0.0, 3.0, 0.0]]), jnp.array([[0.0, 0, 1], [0, 1, 0]]))
+    samples = march(rays, init_occupancy(BOX, resolution=4), options())
+    assert not samples.sample_mask.any()
+
+
+def test_axis_parallel_rays_cross_the_whole_box():
+    rays = Rays(jnp.array([[-3.0, 0.1, 0.2]]), jnp.array([[1.0, 0.0, 0.0]]))
+    samples = march(rays, init_occupancy(BOX, resolution=4), options())
+    np.testing.assert_allclose(samples.deltas.sum(), 2.0, atol=options().step_size)
+
+
+def test_occupancy_finds_a_ball_and_forgets_what_is_gone():
+    occupancy = init_occupancy(BOX, resolution=16)
+
+    def ball(x):
+        return jnp.where(jnp.linalg.norm(x, axis=-1) < 0.5, 50.0, 0.0)
+
+    def nothing(x):
+        return jnp.zeros(len(x))
+
+    update = partial(update_occupancy, num_samples=16**3, step_size=0.05)
+    for i in range(8):
+        occupancy = update(jax.random.key(i), occupancy, ball)
+    inside = jnp.array([[0.0, 0, 0], [0.3, 0, 0]])
+    outside = jnp.array([[0.8, 0, 0], [0.6, 0.6, 0.6]])
+    assert occupancy.occupied[cell_index(occupancy, inside)].all()
+    assert not occupancy.occupied[cell_index(occupancy, outside)].any()
+    # Sampled cells cover the ball's volume share (pi / 48) up to one layer of border cells.
+    assert 0.05 < float(occupancy.occupied.mean()) < 0.13
+    for i in range(60):
+        occupancy = update(jax.random.key(100 + i), occupancy, nothing)
+    assert not occupancy.occupied[cell_index(occupancy, inside)].any()
+
+
+def test_fresh_occupancy_keeps_everything_at_first():
+    occupancy = init_occupancy(BOX, resolution=8)
+    occupancy = update_occupancy(
+        jax.random.key(0), occupancy, lambda x: jnp.zeros(len(x)), num_samples=99, step_size=0.1
+    )
+    assert occupancy.occupied.all()
+
+
+# --- packing ---------------------------------------------------------------------------------
+
+
+def ragged_mask(key, num_rows=30, num_slots=12):
+    count = jax.random.randint(key, (num_rows,), 0, num_slots + 1)
+    return jnp.arange(num_slots) < count[:, None]
+
+
+@pytest.mark.parametrize("capacity", [7, 64, 1000])
+def test_all_passes_equal_dense_evaluation_for_any_capacity(capacity):
+    mask = ragged_mask(jax.random.key(0))
+    table = jax.random.normal(jax.random.key(1), (*mask.shape, 3))
+    got = evaluate_all_passes(lambda row, slot, valid: table[row, slot], mask, capacity=capacity)
+    np.testing.assert_array_equal(got, jnp.where(mask[..., None], table, 0.0))
+
+
+def test_one_pass_keeps_whole_rays_or_none():
+    mask = ragged_mask(jax.random.key(2))
+    table = jax.random.normal(jax.random.key(3), mask.shape)
+    capacity = int(mask.sum()) // 2
+    got, ray_mask = evaluate_one_pass(lambda r, s, v: table[r, s], mask, capacity=capacity)
+    assert 0 < int(ray_mask.sum()) < len(mask)
+    assert int(mask.sum(-1)[ray_mask].sum()) <= capacity
+    want = jnp.where(mask & ray_mask[:, None], table, 0.0)
+    np.testing.assert_array_equal(got, want)
+
+
+# --- the renderer ----------------------------------------------------------------------------
+
+
+def render(rays, samples, **kwargs):
+    settings = {"background": WHITE, "capacity": 64, "exact": True} | kwargs
+    return render_rays(rays, samples, smooth_field_fn, **settings)
+
+
+def test_renderer_agrees_with_a_loop():
+    rays = rays_through(jax.random.key(0), 12)
+    samples = march(rays, random_occupancy(jax.random.key(1)), options())
+    got = render(rays, samples)
+    for ray in range(12):
+        keep = np.asarray(samples.sample_mask[ray])
+        colour, depth, opacity = render_loop(
+            smooth_field_fn,
+            rays.origins[ray],
+            rays.directions[ray],
+            np.asarray(samples.t_mids[ray])[keep],
+            np.asarray(samples.deltas[ray])[keep],
+            np.ones(3),
+        )
+        np.testing.assert_allclose(got.rgb[ray], colour, atol=2e-6)  # float32 sums of 48
+        np.testing.assert_allclose(got.depth[ray], depth, atol=2e-5)
+        np.testing.assert_allclose(got.opacity[ray], opacity, atol=2e-6)
+
+
+def test_one_pass_and_many_passes_agree_where_rays_fit():
+    rays = rays_through(jax.random.key(2), 20)
+    samples = march(rays, random_occupancy(jax.random.key(3)), options())
+    exact = render(rays, samples, capacity=50)
+    roomy = render(rays, samples, capacity=4096, exact=False)
+    assert roomy.ray_mask.all()
+    np.testing.assert_allclose(roomy.rgb, exact.rgb, atol=1e-6)
+    small = render(rays, samples, capacity=100, exact=False)
+    assert 0 < int(small.ray_mask.sum()) < 20
+    np.testing.assert_allclose(small.rgb[small.ray_mask], exact.rgb[small.ray_mask], atol=1e-6)
+
+
+def test_packed_gradients_equal_dense_ones():
+    rays = rays_through(jax.random.key(6), 8)
+    samples = march(rays, random_occupancy(jax.random.key(7)), options())
+    positions = rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]
+    directions = jnp.broadcast_to(rays.directions[:, None], positions.shape)
+
+    def scaled_fn(scale, x, d):
+        density, rgb = smooth_field_fn(scale * x, d)
+        return density, rgb
+
+    def packed(scale):
+        fn = partial(scaled_fn, scale)
+        kwargs = {"background": WHITE, "capacity": 512, "exact": False}
+        return jnp.square(render_rays(rays, samples, fn, **kwargs).rgb).sum()
+
+    def dense(scale):
+        density, rgb = scaled_fn(scale, positions, directions)
+        weights = render_weights(density * samples.sample_mask, samples.deltas)
+        return jnp.square(composite(weights, rgb, WHITE)).sum()
+
+    np.testing.assert_allclose(jax.grad(packed)(1.1), jax.grad(dense)(1.1), rtol=1e-4)
+
+
+def test_displacement_by_a_constant_is_a_shift_of_the_rays():
+    rays = rays_through(jax.random.key(4), 10)
+    samples = march(rays, init_occupancy(BOX, resolution=4), options())
+    shift = jnp.array([0.05, -0.02, 0.03])
+    moved = render(rays, samples, displace_fn=lambda x: jnp.broadcast_to(shift, x.shape))
+    shifted = render(Rays(rays.origins + shift, rays.directions), samples)
+    np.testing.assert_allclose(moved.rgb, shifted.rgb, atol=1e-6)
+
+
+def test_channels_are_composited_over_their_floor():
+    rays = rays_through(jax.random.key(5), 10)
+    empty_ray = Rays(jnp.array([[5.0, 5.0, 5.0]]), jnp.array([[1.0, 0.0, 0.0]]))
+    rays = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), rays, empty_ray)
+    samples = march(rays, init_occupancy(BOX, resolution=4), options())
+    channel = Channel(lambda x: jnp.full(len(x), 2.0), floor=-3.0)
+    got = render(rays, samples, channels={"two": channel})
+    want = 2.0 * got.opacity - 3.0 * (1.0 - got.opacity)
+    np.testing.assert_allclose(got.channels["two"], want, atol=1e-5)
+    assert got.channels["two"][-1] == -3.0 and got.opacity[-1] == 0.0

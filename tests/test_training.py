@@ -1,0 +1,175 @@
+"""Training: masks, traces, learning, checkpoints."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.fields.hash_grid import make_hash_grid_field
+from bavs_jax.rendering.sampling import make_march_options, march
+from bavs_jax.training.batches import (
+    make_pixel_table,
+    pixel_colours,
+    sample_pixels,
+    view_pixel_rays,
+)
+from bavs_jax.training.checkpoints import Checkpoints
+from bavs_jax.training.losses import colour_loss
+from bavs_jax.training.train import init_train_state, make_optimiser, make_train_fn
+from bavs_jax.uncertainty.curvature import add_jac_sq_sum
+from bavs_jax.uncertainty.streaming import make_curvature_fn, training_pixels
+from tests.toy_scenes import toy_scene
+
+
+@pytest.fixture(scope="module")
+def trainer():
+    """A scene with its field, training function and fresh state."""
+    scene = toy_scene()
+    field = make_hash_grid_field(
+        scene.box, num_levels=2, coarsest=8, finest=16, width=16, direction_degree=1
+    )
+    options = make_march_options(
+        scene.box, near=scene.near, far=scene.far, num_steps=32, num_slots=24
+    )
+    optimiser, schedule = make_optimiser(learning_rate=1e-2, final_share=0.3, num_steps=64)
+    train = make_train_fn(
+        field,
+        optimiser,
+        schedule,
+        options,
+        background=scene.background,
+        num_rays=64,
+        capacity=1024,
+        steps_per_call=4,
+    )
+
+    def fresh(seed=0):
+        return init_train_state(
+            jax.random.key(seed), field, optimiser, box=scene.box, occupancy_resolution=16
+        )
+
+    return scene, field, options, train, fresh
+
+
+def test_sampled_pixels_come_from_training_views_alone_and_from_all_of_them(trainer):
+    scene = trainer[0]
+    table = make_pixel_table(scene)
+    mask = np.zeros(scene.num_views, bool)
+    mask[[1, 4, 7]] = True
+    rays, rgb, weight = sample_pixels(jax.random.key(0), table, jnp.asarray(mask), 3000)
+    positions = np.asarray(scene.cameras.positions)
+    owner = np.linalg.norm(rays.origins[:, None] - positions, axis=-1).argmin(1)
+    counts = np.bincount(owner, minlength=scene.num_views)
+    assert set(np.flatnonzero(counts)) == {1, 4, 7} and (weight == 1).all()
+    # Binomial with p = 1/3: standard deviation 26; four of them.
+    np.testing.assert_allclose(counts[[1, 4, 7]], 1000, atol=104)
+    assert rgb.min() >= 0 and rgb.max() <= 1
+
+
+def test_rays_and_colours_belong_together(trainer):
+    """The ray of a pixel numbered in row order points where the picture shows that colour."""
+    scene = trainer[0]
+    table = make_pixel_table(scene)
+    within = jnp.arange(64)
+    view = jnp.full(64, 5)
+    rays = view_pixel_rays(table.cameras, view, within)
+    colours = np.asarray(pixel_colours(table, view, within)).reshape(8, 8, 3)
+    np.testing.assert_allclose(colours, scene.image(5) / 255.0, atol=1e-6)
+    along = -(rays.directions * rays.origins).sum(-1)
+    closest = rays.origins + along[:, None] * rays.directions
+    is_ball = np.linalg.norm(closest, axis=-1) < 0.7
+    assert (is_ball.reshape(8, 8) == (colours < 1).any(-1)).all()
+
+
+def test_masked_pixels_have_no_weight():
+    scene = toy_scene(num_views=4, num_test=1)
+    keep = np.arange(len(scene.pixels)) % 2 == 0
+    table = make_pixel_table(scene).replace(pixel_mask=jnp.asarray(keep))
+    _, _, weight = sample_pixels(jax.random.key(0), table, jnp.ones(4, bool), 400)
+    assert 120 < int(weight.sum()) < 280  # half of 400, many standard deviations wide
+    view_ids, within = training_pixels(table, np.ones(4, bool))
+    assert len(view_ids) == keep.sum()
+    assert (keep[scene.offsets[view_ids] + within]).all()
+
+
+def test_loss_counts_only_weighted_rays():
+    rgb = jnp.array([[1.0, 1, 1], [0.5, 0.5, 0.5]])
+    assert colour_loss(rgb, jnp.zeros((2, 3)), jnp.array([0.0, 1.0])) == 0.25
+    assert colour_loss(rgb, jnp.zeros((2, 3)), jnp.zeros(2)) == 0.0
+
+
+def test_training_learns_and_compiles_once_while_views_are_added(trainer):
+    scene, _, _, train, fresh = trainer
+    table, state = make_pixel_table(scene), fresh()
+    losses = []
+    for call in range(30):
+        mask = jnp.arange(scene.num_views) < 3 + call // 10
+        state, info = train(jax.random.key(call), state, table, mask)
+        losses.append(float(info.loss))
+        if call == 0:
+            traces = train._cache_size()
+    assert np.mean(losses[-5:]) < 0.2 * losses[0]
+    assert train._cache_size() == traces == 1
+    assert int(state.step) == 120
+
+
+def test_training_is_deterministic(trainer):
+    scene, _, _, train, fresh = trainer
+    table, mask = make_pixel_table(scene), jnp.arange(scene.num_views) < 4
+    results = []
+    for _ in range(2):
+        state = fresh()
+        for call in range(3):
+            state, _ = train(jax.random.key(call), state, table, mask)
+        results.append(state.params)
+    jax.tree.map(np.testing.assert_array_equal, *results)
+
+
+def test_streamed_curvature_equals_one_dense_call_for_any_bucket(trainer):
+    scene, field, options, _, fresh = trainer
+    table, state = make_pixel_table(scene), fresh()
+    occupied = jax.random.uniform(jax.random.key(1), state.occupancy.occupied.shape) < 0.3
+    occupancy = state.occupancy.replace(occupied=occupied)
+    params = jax.tree.map(
+        lambda x: x + 0.3 * jax.random.normal(jax.random.key(2), x.shape), state.params
+    )
+    grid = DeformationGrid(jnp.asarray(scene.box), 3)
+    view_ids, within = training_pixels(table, np.arange(scene.num_views) < 2)
+    background = jnp.asarray(scene.background)
+    rays = view_pixel_rays(table.cameras, jnp.asarray(view_ids), jnp.asarray(within))
+    want = add_jac_sq_sum(
+        jnp.zeros((grid.num_vertices, 3)),
+        partial(field.apply, params),
+        grid,
+        rays,
+        march(rays, occupancy, options),
+        background=background,
+    )
+    assert float(want.max()) > 0
+    for buckets, chunk in (((8, 16), 256), ((4,), 999)):
+        curvature = make_curvature_fn(
+            field, grid, options, background=background, buckets=buckets, chunk_samples=chunk
+        )
+        done = []
+        got = curvature(params, occupancy, table, view_ids, within, progress_fn=done.append)
+        # Another order of the same float32 sums.
+        np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5 * float(want.max()))
+        assert sum(done) == len(view_ids)
+
+
+def test_checkpoint_round_trip_keeps_the_newest(trainer, tmp_path):
+    fresh = trainer[-1]
+    checkpoints = Checkpoints(tmp_path / "c")
+    assert checkpoints.latest() is None
+    with pytest.raises(FileNotFoundError, match="no checkpoint"):
+        checkpoints.restore(fresh())
+    for number in (1, 2, 5):
+        checkpoints.save(number, fresh(number), {"number": number})
+    checkpoints.save(5, fresh(7), {"number": 7})  # the same number again replaces it
+    state, meta = checkpoints.restore(fresh())
+    assert checkpoints.latest() == 5 and meta == {"number": 7}
+    jax.tree.map(np.testing.assert_array_equal, state.params, fresh(7).params)
+    checkpoints.close()
