@@ -13,22 +13,23 @@ import pathlib
 import sys
 import time
 
-from absl import app, flags
+from absl import flags
 from ml_collections import config_flags
 
 from bavs_jax.scenes import SceneError
 from bavs_jax.selection.context import SelectionError
 from bavs_jax.selection.policies import POLICIES, get_policy
 from experiments import runtime, workdir
-from experiments.build import build_problem, load_config_scene
+from experiments.build import ConfigError, build_problem, load_config_scene
 from experiments.report import write_report
 from experiments.runner import Run
 
 FLAGS = flags.FLAGS
 config_flags.DEFINE_config_file(
     "config",
-    "experiments/configs/quickstart.py",
-    "What to run; every option is explained in experiments/configs/base.py.",
+    None,
+    "What to run, such as experiments/configs/quickstart.py; every option is explained in "
+    "experiments/configs/base.py and can be set as --config.name=value.",
     lock_config=True,
 )
 flags.DEFINE_string("workdir", None, "Folder for results, checkpoints and report.html.")
@@ -47,32 +48,32 @@ def run_all(config, folder: pathlib.Path, command: str) -> None:
     print(f"{scene.name}: {len(scene.pool)} views to choose from, {len(scene.test)} test views")
     problem = build_problem(config, scene)
     for seed in config.seeds:
-        shared = Run(config, problem, folder, None, seed)
+        shared = Run(config, problem, folder, None, seed, command)
         shared.finish()
         for policy in config.policies:
-            Run(config, problem, folder, policy, seed).finish(shared)
-            workdir.collect(folder, command)
+            Run(config, problem, folder, policy, seed, command).finish(shared)
+            workdir.collect(folder)
     next_views = workdir.export_next_views(folder, config.policies[0], config.seeds[0])
     report = write_report(folder)
     print(f"chosen poses: {next_views}")
     print(f"report:       {report}  ({time.monotonic() - start:.0f} s in all)")
 
 
-def main(argv) -> None:
-    if len(argv) > 1:
-        raise app.UsageError(f"unknown argument {argv[1]!r}; options are given as --name=value")
+def main() -> None:
     if FLAGS.list_policies:
         print("\n".join(POLICIES))
         return
+    if FLAGS.config is None:
+        sys.exit("error: --config: is missing; try --config=experiments/configs/quickstart.py")
     if not FLAGS.workdir:
-        raise app.UsageError("--workdir: is missing; name a folder for the results")
+        sys.exit("error: --workdir: is missing; name a folder for the results")
     if FLAGS.compilation_cache:
         runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
     try:
         run_all(FLAGS.config, pathlib.Path(FLAGS.workdir), runtime.command_line())
-    except (SceneError, SelectionError, workdir.WorkdirError, KeyError) as error:
+    except (SceneError, SelectionError, ConfigError, workdir.WorkdirError) as error:
         sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":
-    app.run(main)
+    runtime.run_script(main)

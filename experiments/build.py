@@ -26,6 +26,7 @@ from bavs_jax.scenes import Scene, SceneError, load_scene
 from bavs_jax.scenes.procedural import capture
 from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
+from bavs_jax.selection.policy import MODES
 from bavs_jax.training.batches import PixelTable, make_pixel_table
 from bavs_jax.training.train import (
     TrainState,
@@ -33,12 +34,17 @@ from bavs_jax.training.train import (
     make_optimiser,
     make_train_fn,
 )
-from bavs_jax.uncertainty.channel import vertex_variance
+from bavs_jax.uncertainty.channel import SCALES, VARIANTS, vertex_variance
+from bavs_jax.uncertainty.curvature import WEIGHTINGS
 from bavs_jax.uncertainty.posterior import default_prior_weight
 from bavs_jax.uncertainty.scoring import make_render_chunk_fn, mean_uncertainty
 from bavs_jax.uncertainty.streaming import make_curvature_fn
 
 RENDER_CHUNK = 8192  # rays of one compiled rendering call
+
+
+class ConfigError(ValueError):
+    """An option that cannot be used: one line that names it and the fix."""
 
 
 class Problem(NamedTuple):
@@ -88,8 +94,27 @@ def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:
     return np.random.default_rng(seed).permutation(np.asarray(scene.pool))[:num]
 
 
+def check_choices(config) -> None:
+    """Raises ConfigError for an option that is not one of its choices."""
+    options = config.uncertainty
+    for name, value, known in (
+        ("uncertainty.weighting", options.weighting, WEIGHTINGS),
+        ("uncertainty.variant", options.variant, VARIANTS),
+        ("uncertainty.scale", options.scale, SCALES),
+        ("candidates.source", config.candidates.source, ("dataset", "hemisphere")),
+        ("candidates.mode", config.candidates.mode, ("", *MODES)),
+    ):
+        if value not in known:
+            raise ConfigError(f"config.{name}: {value!r} is unknown; use one of {known}")
+
+
 def build_problem(config, scene: Scene) -> Problem:
-    """Puts fields, renderer, training, curvature and selection together."""
+    """Puts fields, renderer, training, curvature and selection together.
+
+    Raises:
+      ConfigError: an option that cannot be used.
+    """
+    check_choices(config)
     field = make_hash_grid_field(scene.box, **config.field)
     march = config.march
     march_options = make_march_options(
@@ -115,12 +140,14 @@ def build_problem(config, scene: Scene) -> Problem:
         capacity=train.capacity,
         steps_per_call=train.steps_per_call,
     )
-    init_train = partial(
-        init_train_state,
-        field=field,
-        optimiser=optimiser,
-        box=scene.box,
-        occupancy_resolution=march.occupancy_resolution,
+    init_train = jax.jit(
+        partial(
+            init_train_state,
+            field=field,
+            optimiser=optimiser,
+            box=scene.box,
+            occupancy_resolution=march.occupancy_resolution,
+        )
     )
 
     options = config.uncertainty
@@ -229,7 +256,7 @@ def _radii(config) -> Radii | None:
     if given == (0.0, 0.0):
         return None
     if 0.0 in given:
-        raise ValueError(
+        raise ConfigError(
             "config.candidates: give both min_train_distance and min_candidate_distance, or neither"
         )
     return Radii(*given)
@@ -239,10 +266,6 @@ def _make_source(config, scene: Scene, table: PixelTable) -> tuple[CandidateSour
     options = config.candidates
     if options.source == "dataset":
         return dataset_candidates(scene), table
-    if options.source != "hemisphere":
-        raise ValueError(
-            f"config.candidates.source: {options.source!r} is unknown; use dataset or hemisphere"
-        )
     draws = options.hemisphere_draws
     if config.loader != "procedural":
         return dataset_candidates(scene, hemisphere_draws=draws), table

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import jax
 import numpy as np
 
 from bavs_jax.metrics.depth import depth_mae
@@ -41,16 +42,21 @@ def evaluate_views(render_fn, scene, view_ids, *, lpips_fn=None, progress_fn=Non
         chunk=RENDER_CHUNK,
         progress_fn=progress_fn,
     )
-    rows = []
-    for view_id, image in zip(view_ids, images):
-        truth = scene.image(view_id).astype(np.float32) / 255.0
-        row = measure_images(image["rgb"], truth, lpips_fn=lpips_fn)
-        if scene.depth is not None:
-            row["depth_mae"] = depth_mae(image["depth"], scene.depth_image(view_id))
-        rows.append({k: float(v) for k, v in row.items() if v is not None})
+    rows = [_measure(scene, v, image, lpips_fn) for v, image in zip(view_ids, images)]
     means = {k: _mean([row.get(k) for row in rows]) for k in ("psnr", "ssim", "lpips", "depth_mae")}
     thinned = float(np.mean([image["thinned"].mean() for image in images]))
     return {**means, "thinned": thinned, "num_test_views": len(rows)}
+
+
+_measure_images = jax.jit(measure_images, static_argnames="lpips_fn")
+
+
+def _measure(scene, view_id: int, image: dict, lpips_fn) -> dict[str, float]:
+    truth = scene.image(view_id).astype(np.float32) / 255.0
+    row = _measure_images(image["rgb"], truth, lpips_fn=lpips_fn)
+    if scene.depth is not None:
+        row["depth_mae"] = depth_mae(image["depth"], scene.depth_image(view_id))
+    return {k: float(v) for k, v in row.items() if v is not None}
 
 
 def _mean(values) -> float | None:

@@ -34,8 +34,9 @@ class Run:
     `Run` whose policy is None.
     """
 
-    def __init__(self, config, problem: Problem, workdir: pathlib.Path, policy, seed: int):
+    def __init__(self, config, problem: Problem, workdir: pathlib.Path, policy, seed, command=""):
         self.config, self.problem, self.workdir = config, problem, workdir
+        self.command = command
         self.policy, self.seed = policy, seed
         self.label = f"{policy or 'initial'} seed {seed}"
         self.folder = workdir / (policy or "initial") / f"seed_{seed}"
@@ -57,9 +58,10 @@ class Run:
         last_round = self.config.num_rounds if self.policy else 0
         while True:
             if self._is_trained(state) and len(self.rounds) == int(state.round):
-                self._measure_round(state, is_last=int(state.round) == last_round)
+                is_last = bool(self.policy) and int(state.round) == last_round
+                self._measure_round(state, is_last=is_last)
                 if self.policy:
-                    self._write_files(state, completed=int(state.round) == last_round)
+                    self._write_files(state, completed=is_last)
             if self._is_trained(state) and int(state.round) >= last_round:
                 break
             state = self._one_step(step, state)
@@ -214,6 +216,7 @@ class Run:
             },
             "policy": self.policy,
             "seed": self.seed,
+            "command": self.command,
             "config": self.config.to_dict(),
             "versions": {p: importlib.metadata.version(p) for p in PACKAGES}
             | {"python": platform.python_version()},

@@ -5,8 +5,13 @@ from __future__ import annotations
 import os
 import pathlib
 import sys
+from collections.abc import Callable
 
 import jax
+from absl import app, flags, logging
+
+# What ml_collections raises for an unknown or ill-typed --config.name flag.
+FLAG_ERRORS = (ValueError, KeyError, FileNotFoundError, AttributeError, TypeError)
 
 
 def cache_folder() -> pathlib.Path:
@@ -28,3 +33,24 @@ def command_line() -> str:
     module = sys.modules["__main__"].__spec__
     name = f"python -m {module.name}" if module else f"python {sys.argv[0]}"
     return " ".join([name, *sys.argv[1:]])
+
+
+def run_script(main: Callable[[], None]) -> None:
+    """Runs a script's `main()` after reading its flags; wrong ones end in one line."""
+
+    def parse(argv):
+        try:
+            return flags.FLAGS(argv)
+        except flags.Error as error:
+            sys.exit(f"error: {error}; --help explains every flag")
+        except FLAG_ERRORS as error:
+            sys.exit(f"error: --config: {' '.join(str(error).split())}")
+
+    def without_arguments(argv):
+        if len(argv) > 1:
+            sys.exit(f"error: unknown argument {argv[1]!r}; options are given as --name=value")
+        # Checkpoint libraries report every write at INFO; warnings and errors still show.
+        logging.set_verbosity(logging.WARNING)
+        main()
+
+    app.run(without_arguments, flags_parser=parse)

@@ -47,11 +47,11 @@ def _leaves(values: dict, prefix: str = "") -> dict[str, str]:
     return leaves
 
 
-def collect(workdir: pathlib.Path, command: str) -> dict:
+def collect(workdir: pathlib.Path) -> dict:
     """Collects all `<policy>/seed_<n>/result.json` into `summary.json`."""
     paths = sorted(workdir.glob("*/seed_*/result.json"), key=_run_order)
     runs = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
-    summary = {"schema_version": SUMMARY_VERSION, "command": command, "runs": runs}
+    summary = {"schema_version": SUMMARY_VERSION, "runs": runs}
     write_json(workdir / "summary.json", summary)
     return summary
 

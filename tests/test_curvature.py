@@ -12,11 +12,13 @@ from bavs_jax.fields.deformation import (
     trilinear,
     vertex_number,
 )
+from bavs_jax.rendering.compositing import composite, render_weights
 from bavs_jax.rendering.occupancy import init_occupancy
 from bavs_jax.rendering.sampling import make_march_options, march
 from bavs_jax.uncertainty.curvature import (
     add_jac_sq_sum,
     colour_jacobian,
+    split_colour_jacobian,
     vertex_squares,
     weight_jacobian,
 )
@@ -86,13 +88,40 @@ def test_upper_faces_have_vertices_of_their_own():
     assert int(vertex_number(grid, corner).max()) == grid.num_vertices - 1 == 9**3 - 1
 
 
+def test_split_jacobian_equals_the_plain_one(x64):
+    _, rays, samples = setting()
+    plain = colour_jacobian(smooth_field_fn, rays, samples, background=BACKGROUND)
+    split = split_colour_jacobian(smooth_field_fn, rays, samples, background=BACKGROUND)
+    assert float(jnp.abs(plain[0]).max()) > 0.01
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), split, plain)
+
+
+def test_jacobian_agrees_with_central_differences(x64):
+    _, rays, samples = setting(num_rays=2)
+    jacobian, _ = colour_jacobian(smooth_field_fn, rays, samples, background=BACKGROUND)
+    step = 1e-5
+    for sample, axis in ((0, 0), (3, 1), (7, 2)):
+        colours = []
+        for sign in (1.0, -1.0):
+            offset = jnp.zeros((*samples.t_mids.shape, 3)).at[:, sample, axis].set(sign * step)
+            positions = rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]
+            density, rgb = smooth_field_fn(
+                positions + offset, jnp.broadcast_to(rays.directions[:, None], positions.shape)
+            )
+            colours.append(composite(render_weights(density, samples.deltas), rgb, BACKGROUND))
+        # A central difference has an error of order step^2 times third derivatives of about 10.
+        want = (colours[0] - colours[1]) / (2 * step)
+        np.testing.assert_allclose(jacobian[:, :, sample, axis], want, atol=1e-8)
+
+
+@pytest.mark.parametrize("jacobian_fn", [colour_jacobian, split_colour_jacobian])
 @pytest.mark.parametrize("log2_cells", [1, 2, 3])
-def test_raw_sum_is_the_diagonal_of_the_dense_product(x64, log2_cells):
+def test_raw_sum_is_the_diagonal_of_the_dense_product(x64, log2_cells, jacobian_fn):
     grid, rays, samples = setting(log2_cells=log2_cells)
     dense = dense_jacobian(smooth_field_fn, grid, rays, samples, BACKGROUND)
     matrix = dense.reshape(-1, grid.num_vertices * 3)
     want = jnp.diag(matrix.T @ matrix).reshape(-1, 3)
-    got = raw_sum(grid, rays, samples)
+    got = raw_sum(grid, rays, samples, jacobian_fn=jacobian_fn)
     assert float(want.max()) > 1e-3
     np.testing.assert_allclose(got, want, atol=1e-10)
 

@@ -36,8 +36,8 @@ def make_curvature_fn(
     *,
     background,
     weighting: str = "eq13",
-    buckets: tuple[int, ...] = (8, 16, 32, 64),
-    chunk_samples: int = 4096,
+    buckets: tuple[int, ...] = (16, 32, 64),
+    chunk_samples: int = 8192,
 ) -> Callable:
     """Makes the streamed raw Jacobian sum (Eqs 10-13) over given pixels.
 

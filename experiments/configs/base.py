@@ -44,9 +44,9 @@ def get_config() -> ConfigDict:
 
     # --- training (training/train.py) ---
     config.train = ConfigDict()
-    config.train.num_steps = 1600  # optimiser steps of each round
-    config.train.num_rays = 2048
-    config.train.capacity = 16384  # samples evaluated in one step
+    config.train.num_steps = 3200  # optimiser steps of each round
+    config.train.num_rays = 1024
+    config.train.capacity = 8192  # samples evaluated in one step
     config.train.learning_rate = 1e-2
     config.train.final_share = 0.1  # of the learning rate, at the end of a round
     config.train.steps_per_call = 16  # compiled together

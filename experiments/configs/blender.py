@@ -9,5 +9,4 @@ def get_config():
     config.scene = "lego"
     config.image_size = 100
     config.num_rounds = 4
-    config.train.num_steps = 1600
     return config

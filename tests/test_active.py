@@ -1,0 +1,127 @@
+"""The loop of the paper: rounds, masks, resumption inside a round, captured candidates."""
+
+import io
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bavs_jax.active import init_active_state
+from bavs_jax.candidates import captured_candidates, dataset_candidates, with_empty_views
+from bavs_jax.selection.policies import POLICIES
+from bavs_jax.training.batches import make_pixel_table
+from experiments.build import build_problem, initial_views, load_config_scene
+from experiments.progress import track
+from tests.toy_runs import toy_config
+from tests.toy_scenes import toy_scene
+from tests.traces import count_traces
+
+
+@pytest.fixture(scope="module")
+def problem():
+    config = toy_config()
+    return build_problem(config, load_config_scene(config, cache_dir=None))
+
+
+def start(problem, seed=0):
+    initial = initial_views(problem.scene, seed, 2)
+    train = problem.init_train(jax.random.key(seed))
+    return init_active_state(train, problem.table, initial), initial
+
+
+def silent(total, description, unit):
+    """`track` onto a stream that nobody reads."""
+    return track(total, description, unit, stream=io.StringIO())
+
+
+@pytest.mark.parametrize("policy", sorted(POLICIES))
+def test_rounds_add_batches_of_pool_views_and_trace_nothing_new(problem, policy):
+    state, initial = start(problem)
+    step = problem.make_step(policy, initial, silent, policy)
+    key = jax.random.key(1)
+    state, info = step(key, state)
+    assert info.round == 0 and info.choice is None
+    seen = set(initial.tolist())
+    for number in (1, 2, 3):
+        with count_traces() as traces:
+            state, info = step(key, state)
+        picked = set(info.choice.view_ids.tolist())
+        assert info.round == number and len(picked) == 2
+        assert not picked & seen and picked <= set(problem.scene.pool.tolist())
+        seen |= picked
+        assert set(np.flatnonzero(state.is_training_view).tolist()) == seen
+    # `traces` is of the last round: nothing of fixed shape is traced again while views grow. Only a
+    # bucket of the curvature may be filled for the first time so late, once each.
+    assert not set(traces) & {"train", "render_chunk", "count_samples", "max_min_filter", "top_k"}
+    assert traces.count("add_chunk") <= 3
+
+
+def test_a_step_picked_up_half_way_ends_in_the_same_place(problem):
+    key = jax.random.key(2)
+    state, initial = start(problem)
+    step = problem.make_step("bavs", initial, silent, "bavs")
+    state, _ = step(key, state)
+    saved = []
+
+    def on_call(state, info):
+        saved.append(jax.tree.map(np.asarray, state))
+
+    whole, _ = step(key, jax.tree.map(jnp.copy, state), on_call=on_call)
+    half = jax.tree.map(jnp.asarray, saved[2])
+    assert int(half.calls) == 3
+    resumed, info = step(key, half)
+    assert info.choice is None
+    jax.tree.map(np.testing.assert_array_equal, resumed.train.params, whole.train.params)
+    np.testing.assert_array_equal(resumed.is_training_view, whole.is_training_view)
+
+
+def test_round_zero_does_not_depend_on_the_policy(problem):
+    params = []
+    for policy in ("random", "bavs"):
+        state, initial = start(problem)
+        state, _ = problem.make_step(policy, initial, silent, policy)(jax.random.key(3), state)
+        params.append(state.train.params)
+    jax.tree.map(np.testing.assert_array_equal, *params)
+
+
+def test_initial_views_depend_on_the_seed_alone_and_too_many_are_an_error():
+    scene = toy_scene()
+    np.testing.assert_array_equal(initial_views(scene, 3, 4), initial_views(scene, 3, 4))
+    assert set(initial_views(scene, 3, 4)) != set(initial_views(scene, 4, 4))
+    assert set(initial_views(scene, 0, 9)) == set(scene.pool.tolist())
+    with pytest.raises(ValueError, match="num_initial is 10, but the pool has 9"):
+        initial_views(scene, 0, 10)
+
+
+def test_hemisphere_draws_snap_to_the_nearest_unused_views():
+    scene = toy_scene()
+    source = dataset_candidates(scene, hemisphere_draws=3)
+    used = jnp.zeros(12, bool).at[jnp.array([0, 1])].set(True)
+    offered = source.propose(jax.random.key(0), None, used)
+    assert 1 <= offered.mask.sum() <= 3 and not offered.mask[:2].any()
+    everything = dataset_candidates(scene).propose(jax.random.key(0), None, used)
+    assert everything.mask.sum() == 7
+
+
+def test_captured_pictures_go_into_empty_views_until_these_are_full():
+    scene = toy_scene()
+    table = with_empty_views(make_pixel_table(scene), 2)
+    taken = []
+
+    def capture(cameras):
+        taken.append(np.asarray(cameras.world_from_cam))
+        return np.full((len(cameras) * 64, 3), 50 + len(taken), np.uint8)
+
+    source = captured_candidates(scene, capture, num_candidates=5, first_slot=12)
+    used = jnp.zeros(14, bool).at[0].set(True)
+    offered = source.propose(jax.random.key(0), table, used)
+    assert len(offered.cameras) == 5 and offered.mask.all()
+    table, view_ids = source.acquire(table, used, offered, np.array([3, 1]))
+    assert view_ids.tolist() == [12, 13]
+    np.testing.assert_allclose(table.cameras.world_from_cam[12:], taken[0])
+    np.testing.assert_allclose(taken[0][0], offered.cameras.world_from_cam[3])
+    assert (np.asarray(table.pixels[12 * 64 :]) == 51).all()
+    np.testing.assert_array_equal(table.pixels[: 12 * 64], scene.pixels)
+    with pytest.raises(ValueError, match="0 empty views left for 1 pictures"):
+        source.acquire(table, used.at[view_ids].set(True), offered, np.array([0]))
