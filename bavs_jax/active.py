@@ -111,6 +111,8 @@ def make_active_step(
         stands for them and its sum is scaled up.
       radii: of the max-min distance filter; by default from the cameras.
       mode: "top_k" or "greedy"; by default the policy's own.
+
+    A step raises FloatingPointError if the loss is not finite, before the state is handed on.
     """
 
     def curvature(key, state):
@@ -182,6 +184,11 @@ def make_active_step(
                 state.table,
                 state.is_training_view,
             )
+            if not np.isfinite(train_info.loss):
+                raise FloatingPointError(
+                    f"round {int(state.round)}, training call {call}: the loss is "
+                    f"{float(train_info.loss)}; try a smaller learning rate"
+                )
             state = state.replace(train=train, calls=jnp.int32(call + 1))
             if on_call is not None:
                 on_call(state, train_info)

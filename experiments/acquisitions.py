@@ -77,7 +77,7 @@ def acquisition_arrays(scene, initial, choices: list[dict]) -> dict[str, np.ndar
         "pool": np.asarray(scene.pool),
         "scores": scores,
         "survivors": survivors,
-        "selected": np.array(selected, np.int32).reshape(len(choices), -1),
+        "selected": np.array(selected, np.int32).reshape(len(choices), -1 if choices else 0),
         "initial": np.asarray(initial),
     }
 

@@ -71,6 +71,9 @@ def main() -> None:
         runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
     try:
         run_all(FLAGS.config, pathlib.Path(FLAGS.workdir), runtime.command_line())
+    except OSError as error:
+        # The config file is only read when it is first used.
+        sys.exit(f"error: {' '.join(str(error).split())}")
     except (SceneError, SelectionError, ConfigError, workdir.WorkdirError) as error:
         sys.exit(f"error: {error}")
 

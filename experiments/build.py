@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax import active
+from bavs_jax.cameras import take
 from bavs_jax.candidates import (
     CandidateSource,
     captured_candidates,
@@ -37,10 +38,10 @@ from bavs_jax.training.train import (
 from bavs_jax.uncertainty.channel import SCALES, VARIANTS, vertex_variance
 from bavs_jax.uncertainty.curvature import WEIGHTINGS
 from bavs_jax.uncertainty.posterior import default_prior_weight
-from bavs_jax.uncertainty.scoring import make_render_chunk_fn, mean_uncertainty
+from bavs_jax.uncertainty.scoring import make_render_chunk_fn, mean_uncertainty, reduced_cameras
 from bavs_jax.uncertainty.streaming import make_curvature_fn
 
-RENDER_CHUNK = 8192  # rays of one compiled rendering call
+RENDER_CHUNK = 4096  # rays of one compiled rendering call
 
 
 class ConfigError(ValueError):
@@ -54,12 +55,11 @@ class Problem(NamedTuple):
     table: PixelTable
     init_train: Callable  # key -> TrainState
     make_step: Callable  # (policy name, initial views, track, label) -> an active step
-    render: Callable  # (TrainState, jac_sq_sum, num_rays) -> (Rays [chunk] -> dict)
+    render: Callable  # (TrainState, jac_sq_sum or None, num_rays) -> (Rays [chunk] -> dict)
     curvature: Callable  # (TrainState, table, view_ids, within, progress_fn) -> jac_sq_sum
     lpips_fn: Callable | None
     lpips_reason: str | None
     calls_per_round: int
-    num_vertices: int
     has_empty_views: bool  # whether the table has room for pictures taken on the way
     first_empty_row: int  # of the pixel table
 
@@ -96,6 +96,13 @@ def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:
 
 def check_choices(config) -> None:
     """Raises ConfigError for an option that is not one of its choices."""
+    for name, kind in (("policies", str), ("seeds", int)):
+        values = config[name]
+        if not isinstance(values, tuple) or not all(isinstance(v, kind) for v in values):
+            raise ConfigError(
+                f"config.{name}: is {values!r}; give a tuple of {kind.__name__}, "
+                f"such as {(kind(1), kind(2))}"
+            )
     options = config.uncertainty
     for name, value, known in (
         ("uncertainty.weighting", options.weighting, WEIGHTINGS),
@@ -138,6 +145,7 @@ def build_problem(config, scene: Scene) -> Problem:
         background=scene.background,
         num_rays=train.num_rays,
         capacity=train.capacity,
+        penalty_weight=train.penalty_weight,
         steps_per_call=train.steps_per_call,
     )
     init_train = jax.jit(
@@ -161,7 +169,7 @@ def build_problem(config, scene: Scene) -> Problem:
         grid,
         march_options,
         background=jnp.asarray(scene.background),
-        capacity=2 * RENDER_CHUNK,
+        capacity=8 * RENDER_CHUNK,
         variant=options.variant,
         scale=options.scale,
     )
@@ -171,7 +179,9 @@ def build_problem(config, scene: Scene) -> Problem:
             state.params, state.occupancy, table, view_ids, within, progress_fn=progress_fn
         )
 
-    def render(state: TrainState, jac_sq_sum, num_rays: int):
+    def render(state: TrainState, jac_sq_sum=None, num_rays: int = 0):
+        if jac_sq_sum is None:
+            return partial(render_chunk, state.params, state.occupancy, None)
         variance = vertex_variance(
             jac_sq_sum,
             num_rays=num_rays,
@@ -202,14 +212,11 @@ def build_problem(config, scene: Scene) -> Problem:
 
             def score(indices):
                 scale = config.candidates.image_scale
-                with track(len(indices), f"{label}: score candidates", "views") as task:
+                small = reduced_cameras(take(cameras, indices), scale)
+                num_rays = int(np.prod(np.asarray(small.sizes), axis=-1).sum())
+                with track(num_rays, f"{label}: score {len(indices)} views", "rays") as task:
                     return mean_uncertainty(
-                        chunk_fn,
-                        cameras,
-                        indices,
-                        image_scale=scale,
-                        chunk=RENDER_CHUNK,
-                        progress_fn=task.advance,
+                        chunk_fn, small, chunk=RENDER_CHUNK, progress_fn=task.advance
                     )
 
             return score
@@ -241,7 +248,6 @@ def build_problem(config, scene: Scene) -> Problem:
         lpips_fn=lpips_fn,
         lpips_reason=lpips_reason,
         calls_per_round=calls_per_round,
-        num_vertices=grid.num_vertices,
         has_empty_views=len(table.cameras) > scene.num_views,
         first_empty_row=int(scene.offsets[-1]),
     )

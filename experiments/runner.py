@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
+import json
 import os
 import pathlib
 import platform
@@ -57,12 +58,12 @@ class Run:
         )
         last_round = self.config.num_rounds if self.policy else 0
         while True:
-            if self._is_trained(state) and len(self.rounds) == int(state.round):
-                is_last = bool(self.policy) and int(state.round) == last_round
-                self._measure_round(state, is_last=is_last)
-                if self.policy:
-                    self._write_files(state, completed=is_last)
-            if self._is_trained(state) and int(state.round) >= last_round:
+            number = int(state.round)
+            if self._is_trained(state) and len(self.rounds) == number:
+                self._measure_round(state, is_last=number == self.config.num_rounds)
+            if self._is_trained(state) and self.policy:
+                self._write_files(state, completed=number == last_round)
+            if self._is_trained(state) and number >= last_round:
                 break
             state = self._one_step(step, state)
         self.checkpoints.close()
@@ -136,7 +137,7 @@ class Run:
         num_pixels = int(sum(np.diff(scene.offsets)[view_ids]))
         with track(num_pixels, f"{self.label}: {len(view_ids)} test views", "rays") as bar:
             measures = evaluate_views(
-                self._render_fn(state, with_uncertainty=False),
+                self.problem.render(state.train),
                 scene,
                 view_ids,
                 lpips_fn=self.problem.lpips_fn,
@@ -152,15 +153,14 @@ class Run:
         self._save(state)
         self._log(event="round", round=int(state.round), **row)
 
-    def _render_fn(self, state: ActiveState, *, with_uncertainty: bool):
+    def _uncertain_render_fn(self, state: ActiveState):
+        """Renders colour and uncertainty of a state that may have been picked up from disk."""
         num_rays = int(np.diff(self.problem.scene.offsets)[self.initial].sum())
-        jac_sq_sum = jnp.zeros((self.problem.num_vertices, 3))
-        if with_uncertainty:
-            view_ids, within = training_pixels(state.table, state.is_training_view)
-            with track(len(view_ids), f"{self.label}: curvature for pictures", "rays") as bar:
-                jac_sq_sum = self.problem.curvature(
-                    state.train, state.table, view_ids, within, bar.advance
-                )
+        view_ids, within = training_pixels(state.table, state.is_training_view)
+        with track(len(view_ids), f"{self.label}: curvature for pictures", "rays") as bar:
+            jac_sq_sum = self.problem.curvature(
+                state.train, state.table, view_ids, within, bar.advance
+            )
         return self.problem.render(state.train, jac_sq_sum, num_rays)
 
     # --- files ---
@@ -186,6 +186,9 @@ class Run:
         self.checkpoints.save(number, _saved_part(self.problem, state), meta)
 
     def _write_files(self, state: ActiveState, *, completed: bool) -> None:
+        path = self.folder / "result.json"
+        if path.exists() and json.loads(path.read_text(encoding="utf-8"))["completed"]:
+            return
         scene, config = self.problem.scene, self.config
         choices = acquisitions.load_choices(self.folder, int(state.round))
         write_arrays(
@@ -194,13 +197,12 @@ class Run:
         )
         if completed:
             view_ids = spread_evenly(scene.test, config.num_pictures)
-            pictures = picture_arrays(
-                self._render_fn(state, with_uncertainty=True), scene, view_ids
-            )
+            pictures = picture_arrays(self._uncertain_render_fn(state), scene, view_ids)
             write_arrays(self.folder / "pictures.npz", **pictures, round=int(state.round))
-            path = self.folder / "next_views" / "transforms.json"
-            acquisitions.write_next_views(path, scene, choices)
-        write_json(self.folder / "result.json", self._result(completed))
+            acquisitions.write_next_views(
+                self.folder / "next_views" / "transforms.json", scene, choices
+            )
+        write_json(path, self._result(completed))
 
     def _result(self, completed: bool) -> dict:
         scene = self.problem.scene

@@ -44,7 +44,8 @@ def run_script(main: Callable[[], None]) -> None:
         except flags.Error as error:
             sys.exit(f"error: {error}; --help explains every flag")
         except FLAG_ERRORS as error:
-            sys.exit(f"error: --config: {' '.join(str(error).split())}")
+            reason = " ".join(str(error).split())
+            sys.exit(f"error: --config: no such option, or a value of another type: {reason}")
 
     def without_arguments(argv):
         if len(argv) > 1:

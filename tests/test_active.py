@@ -125,3 +125,12 @@ def test_captured_pictures_go_into_empty_views_until_these_are_full():
     np.testing.assert_array_equal(table.pixels[: 12 * 64], scene.pixels)
     with pytest.raises(ValueError, match="0 empty views left for 1 pictures"):
         source.acquire(table, used.at[view_ids].set(True), offered, np.array([0]))
+
+
+def test_a_loss_that_is_not_finite_stops_the_run(problem):
+    state, initial = start(problem)
+    broken = jax.tree.map(lambda x: x * jnp.nan, state.train.params)
+    state = state.replace(train=state.train.replace(params=broken))
+    step = problem.make_step("random", initial, silent, "random")
+    with pytest.raises(FloatingPointError, match="round 0, training call 0: the loss is nan"):
+        step(jax.random.key(0), state)

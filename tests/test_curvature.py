@@ -8,6 +8,7 @@ import pytest
 from bavs_jax.fields.deformation import (
     DeformationGrid,
     displace,
+    interpolate,
     surrounding_vertices,
     trilinear,
     vertex_number,
@@ -79,6 +80,16 @@ def test_displacement_is_linear_inside_and_exact_on_vertices(x64):
     # Trilinear interpolation reproduces affine functions; only rounding is left.
     np.testing.assert_allclose(displace(grid, theta, points), points @ linear + 0.25, atol=1e-12)
     np.testing.assert_allclose(displace(grid, theta, jnp.asarray(vertices)), theta, atol=1e-12)
+
+
+def test_interpolation_equals_the_sum_over_weights(x64):
+    grid = DeformationGrid(jnp.asarray(BOX), 2)
+    values = jax.random.normal(jax.random.key(4), (grid.num_vertices,))
+    points = jax.random.uniform(jax.random.key(5), (50, 3), minval=-1.3, maxval=1.3)
+    rows, b = trilinear(grid, points)
+    for power in (1, 2):
+        want = (b**power * values[rows]).sum(-1)
+        np.testing.assert_allclose(interpolate(grid, values, points, power=power), want, atol=1e-12)
 
 
 def test_upper_faces_have_vertices_of_their_own():

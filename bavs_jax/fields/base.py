@@ -14,6 +14,7 @@ class Field(NamedTuple):
     `init(key) -> params`
     `apply(params, positions [K, 3], directions [K, 3]) -> (density [K], rgb [K, 3])`
     `density(params, positions [K, 3]) -> density [K]`
+    `penalty(params) -> []`, what training adds to the loss, times a weight
 
     Positions are in scene units, directions are unit vectors, density is in 1 / scene unit and
     colour is sRGB in [0, 1].
@@ -22,3 +23,4 @@ class Field(NamedTuple):
     init: Callable[..., Params]
     apply: Callable[..., tuple]
     density: Callable[..., Any]
+    penalty: Callable[[Params], Any] = lambda params: 0.0

@@ -73,6 +73,33 @@ def trilinear(grid: DeformationGrid, positions: jax.Array) -> tuple[jax.Array, j
     return vertex_number(grid, vertices), trilinear_weights(grid, positions[..., None, :], vertices)
 
 
+def interpolate(grid: DeformationGrid, values: jax.Array, positions: jax.Array, *, power: int = 1):
+    """`sum_k b_k^power values_k` over the eight vertices around each position.
+
+    One corner after another, which a CPU does several times faster than one [..., 8] gather.
+
+    Args:
+      grid: the grid.
+      values: [G] one number per vertex.
+      positions: [..., 3] scene units.
+      power: of the trilinear weights.
+
+    Returns:
+      [...].
+    """
+    scaled = grid_coordinates(grid, positions)
+    base = jnp.minimum(jnp.floor(scaled), grid.cells - 1)
+    frac = scaled - base
+    base = base.astype(jnp.int32)
+    total = 0.0
+    for corner in CORNERS:
+        b = jnp.where(corner, frac, 1.0 - frac)
+        b = b[..., 0] * b[..., 1] * b[..., 2]
+        row = vertex_number(grid, base + corner)
+        total += b**power * values.at[row].get(mode="promise_in_bounds")
+    return total
+
+
 def displace(grid: DeformationGrid, offsets: jax.Array, positions: jax.Array) -> jax.Array:
     """The offset at each position, `D_theta(x) = sum_k b_k theta_k`, scene units.
 

@@ -98,4 +98,9 @@ def make_hash_grid_field(
         unit = to_unit(positions)
         return module.apply({"params": params}, unit, method=HashGridField.geometry)[0]
 
-    return Field(init=init, apply=apply, density=density)
+    def penalty(params):
+        # Mean per level, so that the few entries of a coarse level weigh as much as the many of a
+        # fine one (Barron et al. 2023, section 5): entries that few rays see stay smooth.
+        return sum(jnp.square(table).mean() for table in params["encoding"].values())
+
+    return Field(init=init, apply=apply, density=density, penalty=penalty)

@@ -15,7 +15,7 @@ from bavs_jax.fields.base import Field
 from bavs_jax.rendering.occupancy import Occupancy, init_occupancy, update_occupancy
 from bavs_jax.rendering.render import render_rays
 from bavs_jax.rendering.sampling import MarchOptions, march
-from bavs_jax.training.batches import PixelTable, sample_pixels
+from bavs_jax.training.batches import sample_pixels
 from bavs_jax.training.losses import colour_loss
 
 
@@ -73,6 +73,7 @@ def make_train_fn(
     background,
     num_rays: int,
     capacity: int,
+    penalty_weight: float = 0.0,
     steps_per_call: int = 16,
     occupancy_samples: int | None = None,
 ) -> Callable:
@@ -104,16 +105,16 @@ def make_train_fn(
             "samples": (samples.sample_mask & rendering.ray_mask[:, None]).sum(),
             "thinned": samples.thinned.mean(),
         }
-        return loss, report
+        return loss + penalty_weight * field.penalty(params), {"loss": loss, **report}
 
     def one_step(state, key, table, is_training_view):
-        (loss, report), grads = jax.value_and_grad(loss_fn, has_aux=True)(
+        (_, report), grads = jax.value_and_grad(loss_fn, has_aux=True)(
             state.params, key, state.occupancy, table, is_training_view
         )
         updates, opt_state = optimiser.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
         state = state.replace(step=state.step + 1, params=params, opt_state=opt_state)
-        return state, {"loss": loss, **report}
+        return state, report
 
     @partial(jax.jit, donate_argnums=1)
     def train(key, state, table, is_training_view):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from bavs_jax.fields.deformation import DeformationGrid, trilinear
+from bavs_jax.fields.deformation import DeformationGrid, interpolate
 from bavs_jax.rendering.render import Channel
 from bavs_jax.uncertainty.posterior import (
     bayesrays_vertex_variance,
@@ -46,11 +46,10 @@ def uncertainty_at(
     `posterior`: `sigma^2 = sum_k b_k^2 s_k`, the variance of `sum_k b_k theta_k`.
     `bayesrays`: the same weights normalised, `bhat_k = b_k^2 / sum_k b_k^2`.
     """
-    rows, b = trilinear(grid, positions)
-    weights = b * b
+    summed = interpolate(grid, variance, positions, power=2)
     if variant == "bayesrays":
-        weights = weights / weights.sum(-1, keepdims=True)
-    return jnp.sqrt((weights * variance[rows]).sum(-1))
+        summed = summed / interpolate(grid, jnp.ones_like(variance), positions, power=2)
+    return jnp.sqrt(summed)
 
 
 def make_uncertainty_channel(

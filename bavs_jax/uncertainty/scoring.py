@@ -8,7 +8,7 @@ from functools import partial
 import jax
 import numpy as np
 
-from bavs_jax.cameras import Cameras, rescale, take
+from bavs_jax.cameras import Cameras, rescale
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.rendering.images import render_views
@@ -31,13 +31,17 @@ def make_render_chunk_fn(
 
     Returns:
       `render_chunk(params, occupancy, variance [G], rays [R]) -> {"rgb" [R, 3], "depth" [R],
-      "opacity" [R], "uncertainty" [R], "thinned" [R]}`.
+      "opacity" [R], "thinned" [R], "uncertainty" [R]}`; without the last where `variance` is None.
     """
 
     @jax.jit
     def render_chunk(params, occupancy, variance, rays):
         samples = march(rays, occupancy, march_options)
-        channel = make_uncertainty_channel(grid, variance, variant=variant, scale=scale)
+        channels = {}
+        if variance is not None:
+            channels["uncertainty"] = make_uncertainty_channel(
+                grid, variance, variant=variant, scale=scale
+            )
         rendering = render_rays(
             rays,
             samples,
@@ -45,14 +49,17 @@ def make_render_chunk_fn(
             background=background,
             capacity=capacity,
             exact=True,
-            channels={"uncertainty": channel},
+            channels=channels,
         )
         return {
             "rgb": rendering.rgb,
             "depth": rendering.depth,
             "opacity": rendering.opacity,
-            "uncertainty": finish_uncertainty(rendering.channels["uncertainty"], scale=scale),
             "thinned": samples.thinned,
+            **{
+                name: finish_uncertainty(value, scale=scale)
+                for name, value in rendering.channels.items()
+            },
         }
 
     return render_chunk
@@ -64,27 +71,22 @@ def reduced_cameras(cameras: Cameras, image_scale: float) -> Cameras:
     return rescale(cameras, sizes)
 
 
-def mean_uncertainty(
-    chunk_fn: Callable, cameras: Cameras, indices: np.ndarray, *, image_scale, chunk, progress_fn
-) -> np.ndarray:
-    """Score of candidates, `f = |U|_1 / (W H)` over an image of reduced size (Eq 15).
+def mean_uncertainty(chunk_fn: Callable, cameras: Cameras, *, chunk, progress_fn=None):
+    """Score of candidates, `f = |U|_1 / (W H)` over the pixels of each one's image (Eq 15).
 
     Args:
       chunk_fn: `Rays` [chunk] -> dict with "uncertainty" [chunk], >= 0.
-      cameras: C candidates.
-      indices: [n] int, which of them.
-      image_scale: factor on width and height.
+      cameras: n candidates, mostly of a reduced size (`reduced_cameras`).
       chunk: rays of one compiled call.
-      progress_fn: called with the number of rays done since the last call, or None.
+      progress_fn: called with the number of rays done since the last call.
 
     Returns:
       [n] float32 in the unit of the channel.
     """
-    small = reduced_cameras(take(cameras, np.asarray(indices)), image_scale)
     images = render_views(
         lambda rays: {"uncertainty": chunk_fn(rays)["uncertainty"]},
-        small,
-        np.arange(len(indices)),
+        cameras,
+        np.arange(len(cameras)),
         chunk=chunk,
         progress_fn=progress_fn,
     )

@@ -49,6 +49,7 @@ def get_config() -> ConfigDict:
     config.train.capacity = 8192  # samples evaluated in one step
     config.train.learning_rate = 1e-2
     config.train.final_share = 0.1  # of the learning rate, at the end of a round
+    config.train.penalty_weight = 0.1  # of the field's own penalty: hash tables stay small
     config.train.steps_per_call = 16  # compiled together
 
     # --- uncertainty (bavs_jax/uncertainty) ---
