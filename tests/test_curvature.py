@@ -1,5 +1,7 @@
 """The raw Jacobian sum against dense references, and its weightings against closed forms."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,9 +45,10 @@ def setting(num_rays=6, log2_cells=2, num_steps=24, num_slots=16):
     options = make_march_options(BOX, near=0.0, far=10.0, num_steps=num_steps, num_slots=num_slots)
     occupancy = init_occupancy(BOX, resolution=4)
     occupancy = occupancy.replace(box=jnp.asarray(BOX))
-    return grid, rays, march(rays, occupancy, options)
+    return grid, rays, jax.jit(march)(rays, occupancy, options)
 
 
+@partial(jax.jit, static_argnames=("weighting", "jacobian_fn"))
 def raw_sum(grid, rays, samples, **kwargs):
     zero = jnp.zeros((grid.num_vertices, 3))
     return add_jac_sq_sum(

@@ -12,7 +12,7 @@ import numpy as np
 from flax import struct
 
 # The eight corners of a cell, [8, 3], z fastest.
-CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
+CORNERS = np.indices((2, 2, 2), np.int32).reshape(3, 8).T
 
 
 @struct.dataclass
