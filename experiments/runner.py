@@ -173,9 +173,9 @@ class Run:
         )
         for run in (self, shared):
             if run is not None and run.checkpoints.latest() is not None:
-                saved, meta = run.checkpoints.restore(_saved_part(self.problem, fresh))
+                saved, meta = run.checkpoints.restore(saved_part(self.problem, fresh))
                 self.rounds, self.pending = meta["rounds"], meta["pending"]
-                return _whole_state(self.problem, saved)
+                return whole_state(self.problem, saved)
         return fresh
 
     def _save(self, state: ActiveState) -> None:
@@ -183,7 +183,7 @@ class Run:
         calls = int(state.calls) + (len(self.rounds) > int(state.round))
         number = int(state.round) * (self.problem.calls_per_round + 2) + calls
         meta = {"rounds": self.rounds, "pending": self.pending}
-        self.checkpoints.save(number, _saved_part(self.problem, state), meta)
+        self.checkpoints.save(number, saved_part(self.problem, state), meta)
 
     def _write_files(self, state: ActiveState, *, completed: bool) -> None:
         path = self.folder / "result.json"
@@ -249,7 +249,7 @@ def _cpu_affinity() -> set[int]:
     return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else {*range(os.cpu_count())}
 
 
-def _saved_part(problem: Problem, state: ActiveState):
+def saved_part(problem: Problem, state: ActiveState):
     """The state without the scene's own pixels, which its files hold already."""
     first = problem.first_empty_row
     return {
@@ -262,8 +262,8 @@ def _saved_part(problem: Problem, state: ActiveState):
     }
 
 
-def _whole_state(problem: Problem, saved) -> ActiveState:
-    """The inverse of `_saved_part`."""
+def whole_state(problem: Problem, saved) -> ActiveState:
+    """The inverse of `saved_part`."""
     table = problem.table
     cameras = table.cameras.replace(world_from_cam=saved["world_from_cam"])
     pixels = table.pixels

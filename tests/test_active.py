@@ -11,8 +11,10 @@ from bavs_jax.active import init_active_state
 from bavs_jax.candidates import captured_candidates, dataset_candidates, with_empty_views
 from bavs_jax.selection.policies import POLICIES
 from bavs_jax.training.batches import make_pixel_table
+from bavs_jax.training.checkpoints import Checkpoints
 from experiments.build import build_problem, initial_views, load_config_scene
 from experiments.progress import track
+from experiments.runner import saved_part, whole_state
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 from tests.traces import count_traces
@@ -134,3 +136,40 @@ def test_a_loss_that_is_not_finite_stops_the_run(problem):
     step = problem.make_step("random", initial, silent, "random")
     with pytest.raises(FloatingPointError, match="round 0, training call 0: the loss is nan"):
         step(jax.random.key(0), state)
+
+
+def test_hemisphere_pictures_are_taken_trained_on_and_survive_a_checkpoint(tmp_path):
+    config = toy_config(candidates__source="hemisphere", candidates__hemisphere_draws=9)
+    problem = build_problem(config, load_config_scene(config, cache_dir=None))
+    state, initial = start(problem)
+    step = problem.make_step("bavs", initial, silent, "bavs")
+    for _ in range(2):
+        state, info = step(jax.random.key(0), state)
+    first = problem.scene.num_views
+    assert info.choice.view_ids.tolist() == [first, first + 1]
+    pictures = np.asarray(state.table.pixels[problem.first_empty_row :]).reshape(4, -1)
+    assert pictures[:2].any(axis=1).all() and not pictures[2:].any()
+
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, saved_part(problem, state), {})
+    saved, _ = checkpoints.restore(saved_part(problem, start(problem)[0]))
+    restored = whole_state(problem, saved)
+    jax.tree.map(np.testing.assert_array_equal, restored.table, state.table)
+    np.testing.assert_array_equal(restored.is_training_view, state.is_training_view)
+
+
+def test_training_on_keeps_the_field_and_training_anew_does_not():
+    losses = {}
+    for from_scratch in (True, False):
+        config = toy_config(from_scratch=from_scratch)
+        problem = build_problem(config, load_config_scene(config, cache_dir=None))
+        state, initial = start(problem)
+        step = problem.make_step("random", initial, silent, "random")
+        first = []
+        for _ in range(2):
+            calls = []
+            state, _ = step(jax.random.key(0), state, None, lambda s, i, c=calls: c.append(i))
+            first.append(float(calls[0].loss))
+        losses[from_scratch] = first
+    assert losses[True][0] == losses[False][0]
+    assert losses[False][1] < 0.7 * losses[True][1]

@@ -1,0 +1,71 @@
+"""Turns result files into Markdown tables, and puts them into a page between markers.
+
+    python -m experiments.tables --workdir=runs/quickstart
+    python -m experiments.tables --page=README.md
+
+The first prints the tables of one experiment. The second writes every table of a page anew: each
+stands between `<!-- results: FOLDER -->` and `<!-- end of results -->`, where FOLDER holds a
+`summary.json` and is relative to the page.
+"""
+
+from __future__ import annotations
+
+import pathlib
+import re
+import sys
+
+from absl import flags
+
+from experiments import runtime
+from experiments.files import write_atomic
+from experiments.report import ReportError
+from experiments.report.results import load_runs
+from experiments.report.tables import Table, final_table, timing_table
+
+FLAGS = flags.FLAGS
+flags.DEFINE_string("workdir", None, "Folder of an experiment: print its tables.")
+flags.DEFINE_string("page", None, "Markdown file whose tables are written anew.")
+
+MARKED = re.compile(r"(<!-- results: (\S+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
+
+
+def markdown(table: Table) -> str:
+    """A table as Markdown, with the reasons for its dashes below."""
+    rows = [table.head, ["---"] * len(table.head)]
+    rows += [[cell.text for cell in row] for row in table.rows]
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    reasons = [f"\n— {'; '.join(table.reasons)}."] if table.reasons else []
+    return "\n".join([*lines, *reasons])
+
+
+def result_tables(folder: pathlib.Path) -> str:
+    """Quality at the last shared number of views, and where the time went."""
+    runs = load_runs(folder)
+    policies = list(dict.fromkeys(run.policy for run in runs))
+    command = runs[0].result["command"]
+    made = f"`{command}` ({runs[0].result['device']}; means over seeds ± half of the 95 % interval)"
+    tables = [markdown(final_table(runs, policies)), markdown(timing_table(runs, policies))]
+    return "\n\n".join([made, *tables]) + "\n"
+
+
+def fill_page(text: str, root: pathlib.Path) -> str:
+    """The page with every marked table made anew from the results it names."""
+    return MARKED.sub(lambda m: f"{m[1]}{result_tables(root / m[2])}{m[3]}", text)
+
+
+def main() -> None:
+    if bool(FLAGS.workdir) == bool(FLAGS.page):
+        sys.exit("error: give either --workdir or --page")
+    try:
+        if FLAGS.workdir:
+            print(result_tables(pathlib.Path(FLAGS.workdir)))
+            return
+        page = pathlib.Path(FLAGS.page)
+        text = fill_page(page.read_text(encoding="utf-8"), page.parent)
+        write_atomic(page, lambda file: file.write(text.encode()))
+    except (ReportError, OSError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    runtime.run_script(main)
