@@ -79,6 +79,7 @@ def acquisition_arrays(scene, initial, choices: list[dict]) -> dict[str, np.ndar
         "survivors": survivors,
         "selected": np.array(selected, np.int32).reshape(len(choices), -1 if choices else 0),
         "initial": np.asarray(initial),
+        "names": np.array([*scene.names, *(f"pose {i}" for i in range(num - scene.num_views))]),
     }
 
 

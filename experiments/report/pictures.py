@@ -68,13 +68,18 @@ def shrink(image: np.ndarray, max_side: int) -> np.ndarray:
 
 
 def uncertainty_limits(all_pictures: list[dict[str, np.ndarray]]) -> tuple[float, float]:
-    """One scale for every uncertainty image of a page: its 1st and 99th percentile, rounded."""
+    """One scale for every uncertainty image of a page, over what is seen, not the empty background.
+
+    From the 2nd percentile of the values above half the top to the top, the 99th percentile of
+    all; rounded outwards.
+    """
     values = [p["uncertainty"][:MAX_VIEWS].ravel() for p in all_pictures]
     values = np.concatenate(values) if values else np.zeros(0)
     values = values[np.isfinite(values)]
     if values.size == 0:
         return 0.0, 1.0
-    low, high = np.percentile(values, [1.0, 99.0])
+    high = np.percentile(values, 99.0)
+    low = np.percentile(values[values >= 0.5 * high], 2.0)
     low, high = np.floor(low * 100) / 100, np.ceil(high * 100) / 100
     return float(low), float(high if high > low else low + 0.01)
 
