@@ -5,5 +5,5 @@ from experiments.configs import base
 
 def get_config():
     config = base.get_config()
-    config.train.num_steps = 1600
+    config.train.num_steps = 2400
     return config
