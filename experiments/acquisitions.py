@@ -102,7 +102,7 @@ def write_next_views(path: pathlib.Path, scene, choices: list[dict]) -> None:
             frame |= zip(("k1", "k2", "k3", "k4", "p1", "p2"), cameras.distortion[rank].tolist())
             score = float(choice["selected_scores"][rank])
             frames.append(frame | {"round": number, "rank": rank + 1, "score": score})
-    lens = {"pinhole": "OPENCV", "opencv": "OPENCV"}[scene.cameras.lens]
+    lens = "OPENCV_FISHEYE" if scene.cameras.lens == "fisheye" else "OPENCV"
     write_json(path, {"camera_model": lens, "frames": frames})
 
 

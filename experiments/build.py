@@ -81,7 +81,7 @@ def load_config_scene(config, *, cache_dir: str | None) -> Scene:
             )
         folder = os.path.join(os.environ["BAVS_DATA"], config.loader)
     root = os.path.join(folder, config.scene)
-    return load_scene(config.loader, root=root, image_size=config.image_size)
+    return load_scene(config.loader, root=root, image_size=config.image_size, strict=config.strict)
 
 
 def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:

@@ -10,7 +10,6 @@ import pytest
 
 from bavs_jax.scenes import SceneError, load_nerfstudio, normalise
 from tests.scene_files import edit_json, random_image, write_nerfstudio
-from tests.test_scenes_blender import write_image, write_text
 
 
 def test_intrinsics_lens_and_pixels(tmp_path):
@@ -106,68 +105,6 @@ def test_missing_images_are_skipped_with_one_warning(tmp_path):
     assert scene.names == tuple(f"images/{i:03d}.png" for i in (0, 2, 5, 7))
     with pytest.raises(SceneError, match="4 of 8 images have no file"):
         load_nerfstudio(root, strict=True)
-
-
-def changed(**fields):
-    return lambda root: edit_json(root / "transforms.json", lambda data: data.update(fields))
-
-
-def dropped(*keys):
-    def change(data):
-        for key in keys:
-            data.pop(key)
-
-    return lambda root: edit_json(root / "transforms.json", change)
-
-
-def in_frame(**fields):
-    return lambda root: edit_json(
-        root / "transforms.json", lambda data: data["frames"][1].update(fields)
-    )
-
-
-FAULTS = {
-    "no file": (lambda root: (root / "transforms.json").unlink(), "transforms.json: file is miss"),
-    "broken JSON": (write_text("transforms.json", "{\n\n'"), "transforms.json: line 3"),
-    "no frames": (changed(frames=[]), "frames: missing or empty"),
-    "frames no list": (changed(frames={"a": 1}), "frames: missing or empty"),
-    "unknown lens": (
-        changed(camera_model="FISHEYE9"),
-        "camera_model: 'FISHEYE9' is an unknown lens",
-    ),
-    "unknown frame lens": (
-        in_frame(camera_model=7),
-        r"frames\[1\]\.camera_model: '7' is an unknown",
-    ),
-    "no focal": (dropped("fl_x"), "fl_x: missing: give fl_x or camera_angle_x"),
-    "zero focal": (changed(fl_x=0.0), "fl_x: is 0.0: give a number above 0"),
-    "negative frame focal": (in_frame(fl_y=-3), r"frames\[1\]\.fl_y: is -3"),
-    "text focal": (changed(fl_x="15"), "fl_x: '15' is no number"),
-    "NaN distortion": (changed(k1=float("nan")), "k1: is nan"),
-    "infinite centre": (changed(cx=float("inf")), "cx: is inf"),
-    "zero width": (changed(w=0), "w: is 0"),
-    "aspect": (changed(h=11), r"images/000\.png: image is 12 x 8, not in proportion to w, h"),
-    "image size": (write_image("images/005.png", (9, 9, 3)), r"005\.png: image is 9 x 9"),
-    "broken image": (write_text("images/005.png", "-"), r"005\.png: image cannot be read"),
-    "duplicate": (in_frame(file_path="./images/000.png"), r"frames\[1\]\.file_path: .* duplicate"),
-    "no pose": (in_frame(transform_matrix=None), r"frames\[1\]\.transform_matrix: missing"),
-    "pose shape": (in_frame(transform_matrix=[1, 2]), r"transform_matrix: has shape \[2\]"),
-    "pose scale": (
-        in_frame(transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()),
-        r"frames\[1\]\.transform_matrix: rotation is not orthonormal",
-    ),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_faults_name_file_and_field_in_one_line(tmp_path, fault):
-    damage, message = FAULTS[fault]
-    root = write_nerfstudio(tmp_path)
-    damage(root)
-    with pytest.raises(SceneError, match=message) as caught:
-        load_nerfstudio(root)
-    assert "\n" not in str(caught.value)
-    assert str(tmp_path) in str(caught.value)
 
 
 # --- normalisation ---------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bavs_jax.cameras import image_pixels, pixel_rays
-from bavs_jax.scenes import load_blender, load_nerfstudio
+from bavs_jax.scenes import detect_kind, load_blender, load_llff, load_nerfstudio, load_scene
 from tests.scene_files import DATA
 
 
@@ -77,3 +77,66 @@ def test_egypt_loads_with_the_protocol_of_200_views():
     assert (len(scene.pool), len(scene.test)) == (200, 102)
     np.testing.assert_allclose(np.abs(scene.cameras.positions).max(), 1.0, rtol=1e-6)
     np.testing.assert_array_equal(scene.cameras.sizes[0], [48, 27])
+
+
+def test_fern_loads_with_the_protocol_of_every_eighth_view():
+    scene = load_llff(folder("llff/fern"))
+    np.testing.assert_array_equal(scene.test, [0, 8, 16])
+    assert len(scene.pool) == 17
+    np.testing.assert_array_equal(scene.cameras.sizes[0], [504, 378])
+    np.testing.assert_allclose(scene.cameras.intrinsics[0, :2], 3260.526 / 8, rtol=1e-5)
+    # Forward-facing: cameras side by side, upright, and the box before them.
+    forward = -np.asarray(scene.cameras.world_from_cam)[:, :, 2]
+    assert (forward @ forward.mean(axis=0) > 0.9).all()
+    assert scene.cameras.world_from_cam[:, 2, 1].min() > 0.9
+    to_centre = scene.centre - np.asarray(scene.cameras.positions)
+    assert ((to_centre * forward).sum(axis=-1) > scene.near).all()
+
+
+@pytest.mark.parametrize(
+    "name", ["llff/fern", "nerfstudio/fox", "nerfstudio/Egypt", "blender/lego"]
+)
+def test_kinds_are_told_apart(name):
+    assert detect_kind(folder(name)) == name.split("/")[0]
+
+
+def match_points(first: np.ndarray, second: np.ndarray, num: int) -> list[np.ndarray]:
+    """Pixels [num, 2] of the same places in two photographs, the surest matches first."""
+    cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is in the extra [test]")
+    sift = cv2.SIFT_create(800)
+    points, features = zip(
+        *(sift.detectAndCompute(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), None) for i in (first, second))
+    )
+    matches = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(*features)
+    matches = sorted(matches, key=lambda match: match.distance)[:num]
+    pairs = [[points[0][m.queryIdx].pt, points[1][m.trainIdx].pt] for m in matches]
+    return list(np.swapaxes(np.array(pairs, np.float32) + 0.5, 0, 1))  # centres at integers
+
+
+@pytest.mark.parametrize(
+    ("name", "image_size", "views"),
+    [
+        ("llff/fern", 252, (0, 1)),
+        ("llff/fern", 252, (5, 16)),
+        ("nerfstudio/fox", 270, (10, 12)),
+        ("nerfstudio/Egypt", 480, (50, 53)),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*images have no file")
+def test_rays_through_matching_points_meet(name, image_size, views):
+    """Axes, focal length, centre and lens are right: rays of two views meet in front of both."""
+    scene = load_scene("auto", root=folder(name), image_size=image_size)
+    points = match_points(*(scene.image(view) for view in views), num=60)
+    rays = [pixel_rays(scene.cameras, np.full(60, v), p) for v, p in zip(views, points)]
+    (o1, d1), (o2, d2) = (
+        (np.asarray(r.origins, np.float64), np.asarray(r.directions, np.float64)) for r in rays
+    )
+    normal = np.cross(d1, d2)
+    gap = np.abs(((o2 - o1) * normal).sum(-1)) / np.linalg.norm(normal, axis=-1)
+    t1 = (np.cross(o2 - o1, d2) * normal).sum(-1) / (normal**2).sum(-1)
+    t2 = (np.cross(o2 - o1, d1) * normal).sum(-1) / (normal**2).sum(-1)
+    assert np.mean((t1 > 0.0) & (t2 > 0.0)) > 0.8  # some matches are wrong
+    pixels = gap / t1 * scene.cameras.intrinsics[views[0], 0]
+    assert np.median(np.abs(pixels)) < 0.5
+    if name == "llff/fern":
+        assert np.mean((t1 > scene.near) & (t1 < scene.far)) > 0.8

@@ -56,6 +56,8 @@ def load_split(root: pathlib.Path, split: str, *, image_size, background, strict
     angle = checks.check_number(data.get("camera_angle_x"), path, "camera_angle_x", positive=True)
     if angle >= math.pi:
         raise SceneError(f"{path}: camera_angle_x: is {angle}: give radians below pi")
+    for index, frame in enumerate(frames):
+        checks.check_inside(root, frame["file_path"], path, f"frames[{index}].file_path")
     files = [images.find_image(root, frame["file_path"]) for frame in frames]
     kept = checks.keep_existing(frames, files, path, strict=strict)
 
@@ -78,9 +80,11 @@ def load_split(root: pathlib.Path, split: str, *, image_size, background, strict
             [focal * size[0] / width, focal * size[1] / height, 0.5 * size[0], 0.5 * size[1]]
         )
         views["names"].append(checks.view_name(files[index], root))
+    checks.check_places(np.stack(views["poses"]), path)
     return views
 
 
+@checks.name_refusals
 def load_blender(
     root, *, image_size: int | None = None, background=(1.0, 1.0, 1.0), strict: bool = False
 ) -> Scene:
@@ -101,12 +105,17 @@ def load_blender(
     Raises:
       SceneError: anything in the files that cannot be used.
     """
-    root = pathlib.Path(root).expanduser()
+    root = checks.scene_folder(root)
     options = {"image_size": image_size, "background": background, "strict": strict}
     train = load_split(root, "train", **options)
     test = load_split(root, "test", **options)
     views = {name: train[name] + test[name] for name in train}
     num_train, num_views = len(train["names"]), len(views["names"])
+    for view in sorted(set(train["names"]) & set(test["names"])):
+        raise SceneError(
+            f"{root / 'transforms_test.json'}: '{view}' is also in transforms_train.json: "
+            "list it in one"
+        )
 
     pixels, offsets = pixel_table(views["images"])
     depth = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import os
@@ -15,6 +16,32 @@ from bavs_jax.scenes.base import SceneError
 # Poses written with six digits pass; a scaled or sheared rotation does not.
 ORTHONORMAL_TOLERANCE = 1e-3
 NAMES_IN_WARNING = 3
+ONE_PLACE = 1e-6  # spread of camera positions, relative to their size, below which they coincide
+SIZE_TOLERANCE = 1.0  # pixels; image sizes are rounded when a data set is scaled down
+
+
+def name_refusals(load_fn):
+    """Wraps a loader: what the operating system refuses becomes a `SceneError` with the file."""
+
+    @functools.wraps(load_fn)
+    def load(root, **options):
+        try:
+            return load_fn(root, **options)
+        except OSError as error:
+            path, reason = error.filename or root, error.strerror or error
+            raise SceneError(f"{path}: {reason}: check the file and its permissions") from error
+
+    return load
+
+
+def scene_folder(root) -> pathlib.Path:
+    """The scene's folder, which must exist."""
+    root = pathlib.Path(root).expanduser()
+    if not root.exists():
+        raise SceneError(f"{root}: folder is missing: check the path to the scene")
+    if not root.is_dir():
+        raise SceneError(f"{root}: is a file: give the scene's folder")
+    return root
 
 
 def read_json(path: pathlib.Path) -> dict:
@@ -22,7 +49,7 @@ def read_json(path: pathlib.Path) -> dict:
     if not path.is_file():
         raise SceneError(f"{path}: file is missing: check the scene's folder")
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(path.read_text(encoding="utf-8-sig"))
     except UnicodeDecodeError as error:
         raise SceneError(f"{path}: not UTF-8 text ({error.reason}): save it as UTF-8") from error
     except json.JSONDecodeError as error:
@@ -50,6 +77,15 @@ def check_frames(data: dict, path: pathlib.Path) -> list[dict]:
             )
         seen[name] = index
     return frames
+
+
+def check_inside(root: pathlib.Path, name: str, path: pathlib.Path, field: str) -> None:
+    """A file that a scene names must lie in the scene's folder."""
+    folder = os.path.abspath(root)
+    if os.path.commonpath([folder, os.path.abspath(root / name)]) != folder:
+        raise SceneError(
+            f"{path}: {field}: '{name}' leads out of the scene's folder: move the file into it"
+        )
 
 
 def check_number(value, path: pathlib.Path, field: str, *, positive: bool = False) -> float:
@@ -89,6 +125,31 @@ def check_pose(value, path: pathlib.Path, field: str) -> np.ndarray:
     if pose.shape[0] == 4 and np.abs(pose[3] - last_row).max() > ORTHONORMAL_TOLERANCE:
         raise SceneError(f"{path}: {field}: last row is {pose[3].tolist()}: make it [0, 0, 0, 1]")
     return np.concatenate([pose[:3], [last_row]])
+
+
+def check_places(poses: np.ndarray, path: pathlib.Path) -> None:
+    """Cameras must stand at more than one place, or nothing has a depth.
+
+    Args:
+      poses: [V, 4, 4] camera-to-world.
+      path: for messages.
+    """
+    positions = np.asarray(poses)[:, :3, 3]
+    spread = np.ptp(positions, axis=0).max()
+    if len(positions) > 1 and spread <= ONE_PLACE * max(np.abs(positions).max(), 1.0):
+        raise SceneError(
+            f"{path}: all {len(positions)} cameras stand at one place: "
+            "check the poses' last columns; views from several places are needed"
+        )
+
+
+def check_proportions(size, stated, image_path: pathlib.Path, path: pathlib.Path) -> None:
+    """An image may be scaled down from the stated (width, height), but not cropped."""
+    if abs(size[1] - stated[1] * size[0] / stated[0]) > SIZE_TOLERANCE:
+        raise SceneError(
+            f"{image_path}: image is {size[0]} x {size[1]}, not in proportion to w, h = "
+            f"{stated[0]:g} x {stated[1]:g} in {path.name}: mend the image or w, h"
+        )
 
 
 def check_image_size(size, expected, path: pathlib.Path, field: str) -> None:

@@ -6,10 +6,16 @@ import pathlib
 
 import imageio.v3 as iio
 import numpy as np
+from PIL import Image
 
 from bavs_jax.scenes.base import SceneError
 
-SUFFIXES = ("", ".png", ".jpg", ".jpeg")  # file_path is mostly written without one
+# What a name without a suffix may mean; some cameras write capitals.
+SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")  # of what counts as an image in a folder
+# What Pillow raises on damaged files, and on images of absurd size.
+DAMAGE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
+MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "I;16", "I;16B", "I")
 
 
 def find_image(root: pathlib.Path, file_path: str) -> pathlib.Path | None:
@@ -18,7 +24,43 @@ def find_image(root: pathlib.Path, file_path: str) -> pathlib.Path | None:
         path = root / f"{file_path}{suffix}"
         if path.is_file():
             return path
+    for suffix in SUFFIXES:
+        path = root / f"{file_path}{suffix}"
+        if path.is_dir():
+            raise SceneError(f"{path}: is a folder: put an image file in its place")
     return None
+
+
+def list_images(folder: pathlib.Path) -> list[pathlib.Path]:
+    """The image files of a folder, sorted by name."""
+    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES)
+    if not files:
+        raise SceneError(f"{folder}: holds no images: add them as PNG or JPEG")
+    return files
+
+
+def one_line(error: Exception) -> str:
+    """A foreign error's message without its line breaks."""
+    return " ".join(str(error).split())
+
+
+def decode(path: pathlib.Path) -> np.ndarray:
+    """An image file's values as they are stored, of a colour model that is known."""
+    try:
+        with iio.imopen(path, "r", plugin="pillow") as file:
+            mode = file.metadata(exclude_applied=False).get("mode")
+            image = file.read()
+    except DAMAGE as error:
+        raise SceneError(
+            f"{path}: image cannot be read ({one_line(error)}): save it again"
+        ) from error
+    if mode not in MODES:
+        raise SceneError(f"{path}: image has colour model {mode}: save it as 8-bit RGB or RGBA")
+    if image.dtype == bool:
+        return image.astype(np.uint8) * 255
+    if mode == "I" and image.min() >= 0 and image.max() < 1 << 16:  # 16-bit PNG in older Pillow
+        return image.astype(np.uint16)
+    return image
 
 
 def read_image(path: pathlib.Path) -> np.ndarray:
@@ -35,10 +77,7 @@ def read_image(path: pathlib.Path) -> np.ndarray:
     """
     if not path.is_file():
         raise SceneError(f"{path}: image is missing: add the file or remove its frame")
-    try:
-        image = iio.imread(path, plugin="pillow")
-    except (OSError, SyntaxError, ValueError) as error:  # what Pillow raises on damaged files
-        raise SceneError(f"{path}: image cannot be read ({error}): save it again") from error
+    image = decode(path)
     if image.dtype == np.uint16:
         image = (image // 257).astype(np.uint8)
     if image.ndim == 2:
@@ -59,8 +98,10 @@ def image_size(path: pathlib.Path) -> tuple[int, int]:
         raise SceneError(f"{path}: image is missing: add the file or remove its frame")
     try:
         height, width = iio.improps(path, plugin="pillow").shape[:2]
-    except (OSError, SyntaxError, ValueError) as error:
-        raise SceneError(f"{path}: image cannot be read ({error}): save it again") from error
+    except DAMAGE as error:
+        raise SceneError(
+            f"{path}: image cannot be read ({one_line(error)}): save it again"
+        ) from error
     return width, height
 
 

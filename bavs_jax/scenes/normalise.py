@@ -34,7 +34,7 @@ def rotation_between(source, target) -> np.ndarray:
     return np.eye(3) + skew + skew @ skew / (1.0 + cos)
 
 
-def level_and_scale(poses: np.ndarray) -> np.ndarray:
+def level_and_scale(poses: np.ndarray, *, scale: float | None = None) -> np.ndarray:
     """The similarity that makes a capture upright, centred and of unit size.
 
     The mean of the cameras' up axes becomes +z, the mean of their positions the origin, and the
@@ -42,6 +42,7 @@ def level_and_scale(poses: np.ndarray) -> np.ndarray:
 
     Args:
       poses: [V, 3 or 4, 4] camera-to-world, OpenGL axes.
+      scale: scene units per unit of the poses; None for that of unit size.
 
     Returns:
       [4, 4] float64 `scene_from_user = s [R | -R mean]`.
@@ -54,8 +55,9 @@ def level_and_scale(poses: np.ndarray) -> np.ndarray:
     if np.linalg.norm(up) > PARALLEL:
         rotation = rotation_between(up, [0.0, 0.0, 1.0])
     positions = (poses[:, :3, 3] - middle) @ rotation.T
-    reach = np.abs(positions).max()
-    scale = 1.0 / reach if reach > PARALLEL else 1.0
+    if scale is None:
+        reach = np.abs(positions).max()
+        scale = 1.0 / reach if reach > PARALLEL else 1.0
     scene_from_user = np.eye(4)
     scene_from_user[:3, :3] = scale * rotation
     scene_from_user[:3, 3] = -scale * rotation @ middle

@@ -11,6 +11,7 @@ def get_config() -> ConfigDict:
     config.data_dir = ""  # folder of scenes; empty: $BAVS_DATA/<loader>
     config.scene = "sculpture"  # folder in data_dir (the procedural scene has just this one)
     config.image_size = 100  # pixels of the image width
+    config.strict = False  # whether a listed image without a file is an error, or a warning
 
     # --- the experiment ---
     config.policies = ("bavs", "random")  # see --list_policies; the first one's views are exported

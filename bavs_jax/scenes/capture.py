@@ -1,0 +1,173 @@
+"""From posed photographs, in whatever layout, to a scene: the part that all real captures share."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+from collections.abc import Callable
+
+import numpy as np
+
+from bavs_jax.cameras import Cameras, rescale
+from bavs_jax.scenes import checks, images, maps
+from bavs_jax.scenes.base import Scene, SceneError, pixel_table
+from bavs_jax.scenes.extent import scene_extent
+from bavs_jax.scenes.normalise import level_and_scale, transform_poses
+from bavs_jax.scenes.splits import choose_split
+
+
+@dataclasses.dataclass(frozen=True)
+class Capture:
+    """Photographs with their poses, in the coordinates of the user's own files.
+
+    Views are sorted by the name of their file.
+    """
+
+    root: pathlib.Path  # the scene's folder
+    source: pathlib.Path  # the file or folder that gives the poses, for messages
+    files: tuple[pathlib.Path, ...]  # [V] images
+    poses: np.ndarray  # [V, 4, 4] float64 camera-to-world, OpenGL axes
+    cameras: Cameras  # [V] at the sizes of the image files
+    masks: tuple[pathlib.Path, ...] = ()  # [V] or none at all
+    # [V] or none at all: (width, height) of the image -> depth along the optical axis, or None.
+    depths: tuple[Callable | None, ...] = ()
+    depth_along_ray: bool = False  # the depths are distances along the rays instead
+    bounds: np.ndarray | None = None  # [V, 2] depths along the axis between which content lies
+    split: tuple | None = None  # (pool, test) view ids that come with the files
+    user_from_file: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(4))
+
+
+def make_scene(
+    capture: Capture,
+    *,
+    image_size: int | None = None,
+    pool_size: int | float | None = None,
+    test_every: int | None = None,
+    seed: int = 0,
+    scale: float | None = None,
+    box_half_side: float | None = None,
+    near: float | None = None,
+    far: float | None = None,
+    unbounded: bool = True,
+    background=(1.0, 1.0, 1.0),
+) -> Scene:
+    """Levels, centres and scales a capture's cameras, reads its images and splits its views.
+
+    Coordinates follow nerfstudio's defaults (`level_and_scale`); `Scene.user_from_scene` leads
+    back.
+
+    Args:
+      capture: what a reader found.
+      image_size: wanted width in pixels, at most the original; of the widest image where sizes
+        differ. All images are scaled by one factor.
+      pool_size: views in the pool: an int for a count, a float for a share, drawn by the seed.
+      test_every: instead of pool_size, every so many-th view is a test view, from the first on.
+        Without either the files' own split counts, or else three quarters are the pool.
+      seed: draws the split.
+      scale: scene units per unit of the files; None scales the cameras' largest coordinate to 1.
+      box_half_side: half a side of the scene box around the cameras' mean, scene units; None
+        for 1.5, or for the box that the cameras see between their bounds where these are known.
+      near: closest distance along a ray, scene units; None for 0.9 of the least bound, or 0.05.
+      far: farthest distance, scene units; None for the largest bound, or the farthest corner of
+        the box.
+      unbounded: whether content reaches beyond the box.
+      background: [3] sRGB in [0, 1] to put under transparent pixels.
+
+    Returns:
+      The scene, with +z up.
+
+    Raises:
+      SceneError: anything in the files that cannot be used.
+    """
+    source, num_views = capture.source, len(capture.files)
+    pool, test = choose_split(
+        num_views,
+        capture.split,
+        pool_size=pool_size,
+        test_every=test_every,
+        seed=seed,
+        path=source,
+    )
+    checks.check_places(capture.poses, source)
+    scene_from_file = level_and_scale(capture.poses, scale=scale)
+    unit = float(np.cbrt(np.linalg.det(scene_from_file[:3, :3])))
+
+    widest = int(capture.cameras.sizes[:, 0].max())
+    factor = checks.check_target_width(image_size, widest, source) / widest
+    cameras = rescale(
+        capture.cameras, np.maximum(np.rint(capture.cameras.sizes * factor), 1)
+    ).replace(world_from_cam=transform_poses(scene_from_file, capture.poses).astype(np.float32))
+
+    near, far, box = scene_extent(
+        cameras,
+        None if capture.bounds is None else unit * capture.bounds,
+        box_half_side=box_half_side,
+        near=near,
+        far=far,
+        unbounded=unbounded,
+        path=source,
+    )
+    pixels, offsets = pixel_table(
+        [
+            images.shrink_over(images.read_image(file), int(width), int(height), background)
+            for file, (width, height) in zip(capture.files, cameras.sizes)
+        ]
+    )
+    return Scene(
+        name=capture.root.resolve().name,
+        cameras=cameras,
+        pixels=pixels,
+        offsets=offsets,
+        pool=pool,
+        test=test,
+        box=box,
+        near=near,
+        far=far,
+        background=np.asarray(background, np.float32),
+        names=tuple(checks.view_name(file, capture.root) for file in capture.files),
+        depth=depth_table(capture, cameras, unit),
+        pixel_mask=mask_table(capture, cameras),
+        unbounded=unbounded,
+        user_from_scene=capture.user_from_file @ np.linalg.inv(scene_from_file),
+    )
+
+
+def mask_table(capture: Capture, cameras: Cameras) -> np.ndarray | None:
+    """`Scene.pixel_mask` at the sizes of `cameras`, or None where there are no masks."""
+    if not capture.masks:
+        return None
+    table = []
+    for view, path in enumerate(capture.masks):
+        size = tuple(int(n) for n in capture.cameras.sizes[view])
+        mask = maps.read_mask(path, size, capture.files[view])
+        mask = maps.shrink_mask(mask, *(int(n) for n in cameras.sizes[view]))
+        if not mask.any():
+            width, height = cameras.sizes[view]
+            raise SceneError(
+                f"{path}: mask leaves no pixel at {width} x {height}: "
+                "use a larger image_size or remove the frame"
+            )
+        table.append(mask)
+    return pixel_table(table)[0]
+
+
+def depth_table(capture: Capture, cameras: Cameras, unit: float) -> np.ndarray | None:
+    """`Scene.depth` at the sizes of `cameras`, or None where no view has depth.
+
+    Args:
+      capture: names the depth of each view.
+      cameras: [V] in scene coordinates, at the sizes of the table.
+      unit: scene units per unit of the capture.
+    """
+    if not any(capture.depths):
+        return None
+    table = []
+    for view, read_fn in enumerate(capture.depths):
+        width, height = (int(n) for n in cameras.sizes[view])
+        if read_fn is None:
+            table.append(np.zeros((height, width), np.float32))
+            continue
+        depth = read_fn(tuple(int(n) for n in capture.cameras.sizes[view]))
+        depth = images.nearest_resize(unit * depth, width, height).astype(np.float32)
+        table.append(depth if capture.depth_along_ray else maps.along_rays(depth, cameras, view))
+    return pixel_table(table)[0]
