@@ -7,23 +7,12 @@ import json
 import pathlib
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from bavs_jax.scenes.base import SceneError
 
 QUATERNION_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 ORTHONORMAL_TOLERANCE = 1e-3  # of R R^T from the identity; files hold few digits
-
-
-def rotation_from_quaternion(quaternions) -> np.ndarray:
-    """Rotations [..., 3, 3] from quaternions [..., 4] in the order x, y, z, w, of any length but 0."""
-    q = np.asarray(quaternions, np.float64)
-    x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
 def read_pose_file(path) -> np.ndarray:
@@ -95,7 +84,8 @@ def _pose(entry, where: str) -> np.ndarray:
             values = np.array([float(entry[name]) for name in QUATERNION_COLUMNS])
             if not np.linalg.norm(values[3:]) > 0.0:
                 raise SceneError(f"{where}: the quaternion has no length: give a rotation")
-            pose = np.concatenate([rotation_from_quaternion(values[3:]), values[:3, None]], axis=1)
+            rotation = Rotation.from_quat(values[3:]).as_matrix()  # x, y, z, w
+            pose = np.concatenate([rotation, values[:3, None]], axis=1)
         else:
             pose = np.array(entry, np.float64)
     except KeyError as error:
