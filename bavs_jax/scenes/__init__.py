@@ -20,6 +20,8 @@ def load_scene(kind: str, **kwargs) -> Scene:
     Raises:
       SceneError: an unknown kind, or input that cannot be used.
     """
+    if kind == "auto":
+        kind = "nerfstudio"
     if kind not in LOADERS:
         raise SceneError(f"scene kind '{kind}' is unknown: use one of {', '.join(LOADERS)}")
     return LOADERS[kind](**kwargs)
