@@ -14,6 +14,7 @@ import sys
 import time
 
 from absl import flags
+from ml_collections import config_flags
 
 from bavs_jax.placement.collect import PlacementError
 from bavs_jax.scenes import SceneError, load_scene
@@ -27,10 +28,16 @@ flags.DEFINE_string("data", None, "Folder of the capture, in any layout that can
 flags.DEFINE_string("workdir", None, "Folder for poses, checkpoints and report.html.")
 flags.DEFINE_integer("num_views", 10, "How many poses to propose.")
 flags.DEFINE_string("policy", "bavs", "Acquisition policy that chooses.")
+flags.DEFINE_integer("holdout", 0, "Photos left out of training, to measure the field on.")
 flags.DEFINE_string("loader", "auto", "Layout of the folder; auto: by the files in it.")
 flags.DEFINE_integer("image_size", 135, "Width in pixels to which the widest photo is reduced.")
 flags.DEFINE_integer("train_steps", 2000, "Optimiser steps of the field.")
-flags.DEFINE_integer("holdout", 0, "Photos left out of training, to measure the field on.")
+config_flags.DEFINE_config_dict(
+    "config",
+    settings.default_config(),
+    "Every other option of the field and its uncertainty, as --config.name=value; they are "
+    "explained in experiments/configs/base.py.",
+)
 flags.DEFINE_integer("seed", 0, "Of everything that is drawn.")
 flags.DEFINE_enum("candidates", "shell", settings.KINDS, "Where a camera could stand.")
 flags.DEFINE_integer("num_candidates", 150, "Poses to choose from.")
@@ -74,14 +81,10 @@ def read_options() -> settings.Options:
 def suggest_views(data: pathlib.Path, folder: pathlib.Path, options: settings.Options) -> None:
     """Trains, proposes, chooses and writes."""
     begin = time.monotonic()
-    config = settings.training_config(
-        data.resolve().name,
-        str(data.resolve().parent),
-        loader=FLAGS.loader,
-        image_size=FLAGS.image_size,
-        holdout=FLAGS.holdout,
-        train_steps=FLAGS.train_steps,
-    )
+    config = FLAGS.config
+    config.loader, config.image_size = FLAGS.loader, FLAGS.image_size
+    config.holdout, config.train.num_steps = FLAGS.holdout, FLAGS.train_steps
+    settings.name_scene(config, data)
     scene = load_scene(FLAGS.loader, root=data, image_size=FLAGS.image_size)
     scene = training.all_for_training(scene, FLAGS.holdout)
     folder.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,6 @@ from bavs_jax.selection.batch import SelectionInfo, acquire
 from bavs_jax.selection.context import SelectionError, make_context
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.selection.worth import Worth, worth_along
-from bavs_jax.training.batches import PixelTable
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.scoring import mean_uncertainty, reduced_cameras
 from experiments.build import RENDER_CHUNK, Problem
@@ -66,18 +65,21 @@ def make_add_fn(problem: Problem, train: TrainState, cameras: Cameras, scale: fl
     image and is scaled up to the number of pixels that the photo would have.
     """
     small = reduced_cameras(cameras, scale)
+    table = problem.table
 
     def add(jac_sq_sum, index):
-        camera = jax.tree.map(jnp.asarray, take(small, np.array([index])))
-        num = int(np.prod(camera.sizes[0]))
-        table = PixelTable(
-            cameras=camera,
-            pixels=jnp.zeros((1, 3), jnp.uint8),
-            pixel_mask=jnp.ones(1, bool),
-            offsets=jnp.array([0, num], jnp.int32),
+        # The candidate stands in for view 0, so that all arrays keep the shapes of the photos'
+        # table and nothing is compiled anew; its pixels are not looked at.
+        stand_in = jax.tree.map(
+            lambda x, y: jnp.asarray(x).at[0].set(y[index]), table.cameras, small
         )
-        within = np.arange(num, dtype=np.int32)
-        added = problem.curvature(train, table, np.zeros(num, np.int32), within)
+        num = int(np.prod(np.asarray(small.sizes)[index]))
+        added = problem.curvature(
+            train,
+            table.replace(cameras=stand_in),
+            np.zeros(num, np.int32),
+            np.arange(num, dtype=np.int32),
+        )
         whole = float(np.prod(np.asarray(cameras.sizes)[index]))
         return jac_sq_sum + (whole / num) * added
 

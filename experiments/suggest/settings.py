@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pathlib
 
 import numpy as np
 
@@ -77,14 +78,19 @@ def parse_bounds(text: str) -> np.ndarray | None:
     return bounds
 
 
-def training_config(folder_name: str, data_dir: str, *, loader, image_size, holdout, train_steps):
+def default_config():
     """The config of a field that is trained once on every photo of a capture."""
     config = base.get_config()
-    config.loader, config.scene, config.data_dir = loader, folder_name, data_dir
-    config.image_size, config.holdout = image_size, holdout
-    config.train.num_steps = train_steps
+    config.loader, config.image_size = "auto", 135
+    config.holdout = 0  # photos left out of training, to measure the field on
+    config.train.num_steps = 2000
     config.lpips_net = ""
     config.checkpoint_seconds = 20.0
     # Every photo's rays weigh in the curvature through a uniform subset, scaled up.
     config.uncertainty.max_rays = 40_000
     return config
+
+
+def name_scene(config, data: pathlib.Path) -> None:
+    """Puts the capture's folder into the config."""
+    config.scene, config.data_dir = data.resolve().name, str(data.resolve().parent)
