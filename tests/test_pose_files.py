@@ -34,9 +34,7 @@ def test_every_form_holds_the_same_poses(tmp_path, poses):
             ["name," + ",".join(names)] + ["p," + ",".join(map(repr, r)) for r in rows.tolist()]
         ),
         "rows12.csv": "\n".join(",".join(map(repr, p.ravel().tolist())) for p in poses),
-        "rows16.csv": "\n\n".join(
-            ",".join(map(repr, np.ravel(m).tolist())) for m in square
-        ),
+        "rows16.csv": "\n\n".join(",".join(map(repr, np.ravel(m).tolist())) for m in square),
     }
     for name, text in forms.items():
         (tmp_path / name).write_text(text)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bavs_jax.cameras import look_at
+from bavs_jax.placement.collect import PlacementError
 
 MAX_LAPS = 64  # of drawing again what left the shell
 
@@ -52,7 +53,7 @@ def shell_positions(
       positions [N, 3] float64, and the two cameras [N, 2] int that each lies between.
 
     Raises:
-      ValueError: after many laps, too few places lie within the shell.
+      PlacementError: after many laps, too few places lie within the shell.
     """
     cameras = np.asarray(camera_positions, np.float64)
     focus, up = np.asarray(focus, np.float64), np.asarray(up, np.float64)
@@ -76,7 +77,10 @@ def shell_positions(
         pairs = np.concatenate([pairs, pair[keep]])
         if len(places) >= num:
             return places[:num], pairs[:num]
-    raise ValueError(f"only {len(places)} of {num} places lie in the shell of the cameras")
+    raise PlacementError(
+        f"candidates: only {len(places)} of {num} places lie in the shell of the cameras: "
+        "change the spread, or draw from a box"
+    )
 
 
 def box_positions(rng: np.random.Generator, num: int, bounds) -> np.ndarray:
@@ -92,7 +96,7 @@ def _middle(values: np.ndarray) -> float:
 def _between(offsets: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Offsets [N, 2, 3] from a centre to one [N, 3] between them, on the arc around it."""
     lengths = np.linalg.norm(offsets, axis=-1)
-    units = offsets / lengths[..., None]
+    units = offsets / np.maximum(lengths, 1e-12)[..., None]
     cosine = np.clip((units[:, 0] * units[:, 1]).sum(axis=-1), -1.0, 1.0)
     angle = np.arccos(cosine)
     # Beside equal and opposite directions the sine vanishes; those take the straight line.

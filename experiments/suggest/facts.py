@@ -13,8 +13,11 @@ from bavs_jax.scenes import Scene
 from experiments.suggest.places import Surroundings
 
 RARE = 90.0  # percentile of the photos' pixels above which uncertainty counts as high
-THIRDS = (("upper left", "upper", "upper right"), ("left", "middle", "right"))
-THIRDS = (*THIRDS, ("lower left", "lower", "lower right"))
+NINTHS = (
+    ("upper left", "upper middle", "upper right"),
+    ("left", "middle", "right"),
+    ("lower left", "lower middle", "lower right"),
+)
 GATHERED = 0.4  # share of the high pixels in one ninth of the image, to say that they are there
 ALL_AROUND = 0.25  # length of the photos' mean direction below which they have no common side
 
@@ -28,21 +31,20 @@ class Facts:
     nearest_photo: str
     nearest_distance: float
     turned: float  # degrees between its gaze and the nearest photo's
-    bearing: str  # where it stands around the scene
+    bearing: str  # where it stands around the focus
     num_seeing: int  # photos that see the place where it stands, unhidden
-    opacity: float  # mean share of its light that comes from the field
 
     def sentence(self) -> str:
         """Why this pose, and what to mind, in plain words."""
-        where = f", most of them in the {self.where_high} of the image" if self.where_high else ""
+        where = f", most of those in the {self.where_high} of the image" if self.where_high else ""
         words = (
-            f"Sees {self.share_high:.0%} of its pixels above the uncertainty that only "
-            f"{1 - RARE / 100:.0%} of the photos' pixels exceed{where}; stands "
-            f"{length(self.nearest_distance)} from the nearest photo ({self.nearest_photo}), "
-            f"turned {self.turned:.0f}° from it; {self.bearing}."
+            f"{self.share_high:.0%} of its pixels are more uncertain than {RARE:.0f}% of the "
+            f"photos' pixels{where}. It stands {self.bearing}; the nearest photo "
+            f"({self.nearest_photo}) is {length(self.nearest_distance)} away and turned by "
+            f"{self.turned:.0f}°."
         )
         if self.num_seeing == 0:
-            words += " No photo sees the place where it stands: make sure that it is free."
+            words += " No photo sees this place."
         return words
 
 
@@ -66,7 +68,7 @@ def pose_facts(
       scene: the capture.
       around: from `look_around`.
       cameras: [k] the chosen poses.
-      images: [k] their renders, with "uncertainty" and "opacity" [H, W].
+      images: [k] their renders, with "uncertainty" [H, W].
       photo_uncertainty: uncertainty of many pixels of the photos, any shape.
       density_fn: points [K, 3] -> density [K], scene units.
     """
@@ -87,7 +89,6 @@ def pose_facts(
                 turned=float(np.degrees(np.arccos(cosine))),
                 bearing=bearing(pose[:, 3], photos[:, :, 3], around, scene.up),
                 num_seeing=count_seeing(scene, pose[:, 3], density_fn),
-                opacity=float(image["opacity"].mean()),
             )
         )
     return facts
@@ -103,7 +104,7 @@ def gathered_where(is_high: np.ndarray) -> str | None:
         for rows in np.array_split(is_high, 3, axis=0)
     ]
     row, column = np.unravel_index(np.argmax(ninths), (3, 3))
-    return THIRDS[row][column] if ninths[row][column] >= GATHERED * total else None
+    return NINTHS[row][column] if ninths[row][column] >= GATHERED * total else None
 
 
 def bearing(position, photo_positions, around: Surroundings, up) -> str:
@@ -117,16 +118,16 @@ def bearing(position, photo_positions, around: Surroundings, up) -> str:
     rise = np.degrees(np.arcsin(np.clip(_unit(own) @ up, -1.0, 1.0)))
     elevations = np.degrees(np.arcsin(np.clip(_unit(others) @ up, -1.0, 1.0)))
     above = rise - np.median(elevations)
-    height = f"{abs(above):.0f}° {'above' if above >= 0 else 'below'} their middle elevation"
+    height = f"{abs(above):.0f}° {'above' if above >= 0 else 'below'}"
     level = _unit(others - (others @ up)[:, None] * up).mean(axis=0)
     if np.linalg.norm(level) < ALL_AROUND:
-        return f"the photos stand all around; this pose is {height}"
+        return f"{height} the middle elevation of the photos, which are all around"
     forward = -_unit(level)
     flat = own - (own @ up) * up
     left = np.cross(up, forward)
     angle = np.degrees(np.arctan2(flat @ left, -(flat @ forward)))
     side = "left" if angle >= 0 else "right"
-    return f"around the focus it is {abs(angle):.0f}° to the {side} of the photos' middle, {height}"
+    return f"{abs(angle):.0f}° to the {side} of the photos' middle and {height} it"
 
 
 def count_seeing(scene: Scene, position, density_fn: Callable) -> int:

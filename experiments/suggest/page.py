@@ -35,6 +35,7 @@ def write_page(path: pathlib.Path, **content) -> None:
         content[name] = Markup(content[name])
     text = environment.get_template("template.html").render(**content)
     write_atomic(path, lambda file: file.write(text.encode()))
+    path.chmod(0o644)  # temporary files start out private
 
 
 def preview_cards(images: list[dict], rows: list[dict], sentences: list[str]) -> tuple:

@@ -67,11 +67,7 @@ def render_previews(problem: Problem, train, jac_sq_sum, cameras: Cameras) -> li
     num_rays = int(np.prod(np.asarray(cameras.sizes), axis=-1).sum())
     with track(num_rays, f"render {len(cameras)} previews", "rays") as bar:
         return render_views(
-            lambda rays: {k: render(rays)[k] for k in ("rgb", "opacity", "uncertainty")},
-            cameras,
-            np.arange(len(cameras)),
-            chunk=RENDER_CHUNK,
-            progress_fn=bar.advance,
+            render, cameras, np.arange(len(cameras)), chunk=RENDER_CHUNK, progress_fn=bar.advance
         )
 
 
