@@ -57,6 +57,7 @@ class Problem(NamedTuple):
     make_step: Callable  # (policy name, initial views, track, label) -> an active step
     render: Callable  # (TrainState, jac_sq_sum or None, num_rays) -> (Rays [chunk] -> dict)
     curvature: Callable  # (TrainState, table, view_ids, within, progress_fn) -> jac_sq_sum
+    density: Callable  # (TrainState, positions [K, 3]) -> density [K], 0 where nothing is rendered
     lpips_fn: Callable | None
     lpips_reason: str | None
     calls_per_round: int
@@ -191,6 +192,13 @@ def build_problem(config, scene: Scene) -> Problem:
         )
         return partial(render_chunk, state.params, state.occupancy, variance)
 
+    @jax.jit
+    def density(state: TrainState, positions):
+        # Outside of its box a field reads the nearest face, but the renderer never looks there.
+        lower, upper = jnp.asarray(scene.box)
+        in_box = ((positions >= lower) & (positions <= upper)).all(-1)
+        return jnp.where(in_box, field.density(state.params, positions), 0.0)
+
     def restart(key, state: TrainState) -> TrainState:
         fresh = init_train(key)
         if config.from_scratch:
@@ -245,6 +253,7 @@ def build_problem(config, scene: Scene) -> Problem:
         make_step=make_step,
         render=render,
         curvature=curvature,
+        density=density,
         lpips_fn=lpips_fn,
         lpips_reason=lpips_reason,
         calls_per_round=calls_per_round,

@@ -1,0 +1,1 @@
+"""Where to stand next: the parts of `python -m experiments.suggest_views`."""

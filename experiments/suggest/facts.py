@@ -1,0 +1,154 @@
+"""What is known of each chosen pose: measured facts, and a sentence made of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from bavs_jax.cameras import Cameras
+from bavs_jax.placement.clearance import optical_depth
+from bavs_jax.scenes import Scene
+from experiments.suggest.places import Surroundings
+
+RARE = 90.0  # percentile of the photos' pixels above which uncertainty counts as high
+NINTHS = (
+    ("upper left", "upper middle", "upper right"),
+    ("left", "middle", "right"),
+    ("lower left", "lower middle", "lower right"),
+)
+GATHERED = 0.4  # share of the high pixels in one ninth of the image, to say that they are there
+ALL_AROUND = 0.25  # length of the photos' mean direction below which they have no common side
+
+
+@dataclasses.dataclass(frozen=True)
+class Facts:
+    """One chosen pose; lengths in user units."""
+
+    share_high: float  # of its pixels, more uncertain than all but a tenth of the photos' pixels
+    where_high: str | None  # ninth of the image with many of them, or None
+    nearest_photo: str
+    nearest_distance: float
+    turned: float  # degrees between its gaze and the nearest photo's
+    bearing: str  # where it stands around the focus
+    num_seeing: int  # photos that see the place where it stands, unhidden
+
+    def sentence(self) -> str:
+        """Why this pose, and what to mind, in plain words."""
+        where = f", most of those in the {self.where_high} of the image" if self.where_high else ""
+        words = (
+            f"{self.share_high:.0%} of its pixels are more uncertain than {RARE:.0f}% of the "
+            f"photos' pixels{where}. It stands {self.bearing}; the nearest photo "
+            f"({self.nearest_photo}) is {length(self.nearest_distance)} away and turned by "
+            f"{self.turned:.0f}°."
+        )
+        if self.num_seeing == 0:
+            words += " No photo sees this place."
+        return words
+
+
+def length(value: float) -> str:
+    """A length in user units, with three digits."""
+    return f"{value:.3g} units"
+
+
+def pose_facts(
+    scene: Scene,
+    around: Surroundings,
+    cameras: Cameras,
+    images: list[dict[str, np.ndarray]],
+    *,
+    photo_uncertainty: np.ndarray,
+    density_fn: Callable,
+) -> list[Facts]:
+    """Measures every chosen pose.
+
+    Args:
+      scene: the capture.
+      around: from `look_around`.
+      cameras: [k] the chosen poses.
+      images: [k] their renders, with "uncertainty" [H, W].
+      photo_uncertainty: uncertainty of many pixels of the photos, any shape.
+      density_fn: points [K, 3] -> density [K], scene units.
+    """
+    high = np.percentile(photo_uncertainty, RARE)
+    photos = np.asarray(scene.cameras.world_from_cam, np.float64)[scene.pool]
+    facts = []
+    for pose, image in zip(np.asarray(cameras.world_from_cam, np.float64), images):
+        distances = np.linalg.norm(photos[:, :, 3] - pose[:, 3], axis=-1)
+        nearest = int(np.argmin(distances))
+        cosine = np.clip(photos[nearest, :, 2] @ pose[:, 2], -1.0, 1.0)
+        is_high = image["uncertainty"] > high
+        facts.append(
+            Facts(
+                share_high=float(is_high.mean()),
+                where_high=gathered_where(is_high),
+                nearest_photo=scene.names[scene.pool[nearest]],
+                nearest_distance=around.unit * float(distances[nearest]),
+                turned=float(np.degrees(np.arccos(cosine))),
+                bearing=bearing(pose[:, 3], photos[:, :, 3], around, scene.up),
+                num_seeing=count_seeing(scene, pose[:, 3], density_fn),
+            )
+        )
+    return facts
+
+
+def gathered_where(is_high: np.ndarray) -> str | None:
+    """The ninth of an image [H, W] that holds a good part of its marked pixels, if one does."""
+    total = is_high.sum()
+    if total == 0:
+        return None
+    ninths = [
+        [part.sum() for part in np.array_split(rows, 3, axis=1)]
+        for rows in np.array_split(is_high, 3, axis=0)
+    ]
+    row, column = np.unravel_index(np.argmax(ninths), (3, 3))
+    return NINTHS[row][column] if ninths[row][column] >= GATHERED * total else None
+
+
+def bearing(position, photo_positions, around: Surroundings, up) -> str:
+    """Where a camera stands around the focus, compared with the photos.
+
+    Left and right are those of someone who stands where the photos are in the mean and looks at
+    the focus. Photos from all around have no such side; then the height alone is told.
+    """
+    up = np.asarray(up, np.float64)
+    own, others = position - around.focus, photo_positions - around.focus
+    rise = np.degrees(np.arcsin(np.clip(_unit(own) @ up, -1.0, 1.0)))
+    elevations = np.degrees(np.arcsin(np.clip(_unit(others) @ up, -1.0, 1.0)))
+    above = rise - np.median(elevations)
+    height = f"{abs(above):.0f}° {'above' if above >= 0 else 'below'}"
+    level = _unit(others - (others @ up)[:, None] * up).mean(axis=0)
+    if np.linalg.norm(level) < ALL_AROUND:
+        return f"{height} the middle elevation of the photos, which are all around"
+    forward = -_unit(level)
+    flat = own - (own @ up) * up
+    left = np.cross(up, forward)
+    angle = np.degrees(np.arctan2(flat @ left, -(flat @ forward)))
+    side = "left" if angle >= 0 else "right"
+    return f"{abs(angle):.0f}° to the {side} of the photos' middle and {height} it"
+
+
+def count_seeing(scene: Scene, position, density_fn: Callable) -> int:
+    """How many photos have a place in their image, with at least half of its light unhidden.
+
+    Numerics: lens distortion is left out, which moves the image's edge by a few pixels.
+    """
+    cameras, pool = scene.cameras, scene.pool
+    poses = np.asarray(cameras.world_from_cam, np.float64)[pool]
+    local = np.einsum("vij,vi->vj", poses[:, :, :3], position - poses[:, :, 3])
+    depth = -local[:, 2]
+    fx, fy, cx, cy = np.asarray(cameras.intrinsics, np.float64)[pool].T
+    safe = np.where(depth > 0.0, depth, 1.0)
+    x, y = cx + fx * local[:, 0] / safe, cy - fy * local[:, 1] / safe
+    width, height = np.asarray(cameras.sizes)[pool].T
+    in_image = (depth > 0.0) & (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
+    # All photos at once, so that the field is compiled for one shape.
+    depths = optical_depth(density_fn, poses[:, :, 3], np.broadcast_to(position, (len(pool), 3)))
+    return int((in_image & (depths < np.log(2.0))).sum())
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    norm = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.maximum(norm, 1e-12)

@@ -1,0 +1,85 @@
+"""The page that shows where to stand next, and why."""
+
+from __future__ import annotations
+
+import math
+import pathlib
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from bavs_jax.selection.worth import Worth
+from experiments.files import write_atomic
+from experiments.report.pictures import (
+    UNCERTAINTY_MAP,
+    colourise,
+    png_uri,
+    shrink,
+    uncertainty_limits,
+)
+
+MAX_SIDE = 300  # pixels of a preview
+
+
+def write_page(path: pathlib.Path, **content) -> None:
+    """Fills the template; every name that it uses must be in `content`."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(pathlib.Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    for name in ("place", "worth_curve"):
+        content[name] = Markup(content[name])
+    text = environment.get_template("template.html").render(**content)
+    write_atomic(path, lambda file: file.write(text.encode()))
+    path.chmod(0o644)  # temporary files start out private
+
+
+def preview_cards(images: list[dict], rows: list[dict], sentences: list[str]) -> tuple:
+    """One card per pose with its render and uncertainty, and the scale of the latter."""
+    limits = uncertainty_limits([{"uncertainty": image["uncertainty"][None]} for image in images])
+    cards = []
+    for image, row, sentence in zip(images, rows, sentences):
+        rgb = np.round(255.0 * np.clip(image["rgb"], 0.0, 1.0)).astype(np.uint8)
+        uncertainty = colourise(shrink(image["uncertainty"], MAX_SIDE), *limits, UNCERTAINTY_MAP)
+        cards.append(
+            {
+                "row": row,
+                "sentence": sentence,
+                "render": png_uri(shrink(rgb, MAX_SIDE)),
+                "uncertainty": png_uri(uncertainty),
+                "mean": f"{image['uncertainty'].mean():.3f}",
+            }
+        )
+    ramp = colourise(np.linspace(*limits, 256)[None], *limits, UNCERTAINTY_MAP)
+    bar = {"uri": png_uri(ramp), "low": f"≤ {limits[0]:.2f}", "high": f"≥ {limits[1]:.2f}"}
+    return cards, bar
+
+
+def worth_sentence(worth: Worth, photo_level: float) -> str:
+    """How much is left to gain, so that the user can judge when to stop."""
+    num, first, left = len(worth.picked), worth.picked[0], worth.best_left[-1]
+    if math.isnan(left):
+        return f"No candidate is left after these {num}: draw more to see what else there is."
+    words = (
+        f"After {'this pose' if num == 1 else f'these {num}'}, the best candidate left scores "
+        f"{left:.3f}, which is {left / first:.0%} of the first pick's {first:.3f}."
+    )
+    if first <= photo_level:
+        return words + (
+            f" Even the first pick scores no more than the median photo ({photo_level:.3f}): "
+            "the candidates hardly show anything that the photos do not."
+        )
+    excess = max(left - photo_level, 0.0) / (first - photo_level)
+    words += (
+        f" Counted above {photo_level:.3f}, the median of the photos that are there already, "
+        f"it is worth {excess:.0%} of the first pick:"
+    )
+    if excess >= 0.5:
+        return words + " further views are still worth taking."
+    if excess >= 0.2:
+        return words + " further views gain less and less."
+    return words + " there is little left to gain, this is a good place to stop."

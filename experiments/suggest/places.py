@@ -1,0 +1,159 @@
+"""Candidate poses by the user's options: drawn or read, then judged by the trained field."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from bavs_jax.cameras import Cameras, hemisphere_poses, take
+from bavs_jax.placement.clearance import judge_positions, matter_density, within_bounds
+from bavs_jax.placement.collect import check_enough, collect_poses
+from bavs_jax.placement.focus import focus_point, share_facing
+from bavs_jax.placement.proposals import aim, box_positions, shell_positions, turned_targets
+from bavs_jax.scenes import Scene
+from bavs_jax.scenes.normalise import transform_poses
+from bavs_jax.scenes.pose_files import read_pose_file
+from experiments.suggest.settings import Options
+
+CLEARANCE_SHARE = 0.05  # of the median distance of the photos from what they look at
+SOLID_SHARE = 0.05  # the same, over which solid matter takes away half of the light
+FIXES = {
+    "out of bounds": "widen --bounds",
+    "inside matter": "move --bounds or the poses into free space, or lower --holdout and raise "
+    "--train_steps if the field is foggy",
+    "too near to matter": "lower --clearance",
+    "": "list more poses, or lower --num_views",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Surroundings:
+    """What the photos say about the place, in scene units; `unit` leads to the user's."""
+
+    focus: np.ndarray  # [3] what the photos look at
+    distance: float  # median of the photos from there
+    faces_focus: bool  # false: the photos look outwards
+    clearance: float
+    solid_density: float
+    unit: float  # user units per scene unit
+    user_from_scene: np.ndarray  # [4, 4]
+
+    def to_user(self, positions) -> np.ndarray:
+        """Points [..., 3] in the user's coordinates."""
+        matrix = self.user_from_scene
+        return np.asarray(positions, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+
+    def to_scene(self, positions) -> np.ndarray:
+        """Points [..., 3] from the user's coordinates."""
+        matrix = np.linalg.inv(self.user_from_scene)
+        return np.asarray(positions, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def look_around(scene: Scene, options: Options) -> Surroundings:
+    """Finds the focus of the photos and sets the lengths that follow from it."""
+    poses = np.asarray(scene.cameras.world_from_cam)
+    focus = focus_point(poses, scene.centre)
+    distance = float(np.median(np.linalg.norm(poses[:, :, 3] - focus, axis=-1)))
+    matrix = np.asarray(scene.user_from_scene, np.float64)
+    unit = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    return Surroundings(
+        focus=focus,
+        distance=distance,
+        faces_focus=share_facing(poses, focus) >= 0.5,
+        clearance=options.clearance / unit or CLEARANCE_SHARE * distance,
+        solid_density=matter_density(SOLID_SHARE * distance),
+        unit=unit,
+        user_from_scene=matrix,
+    )
+
+
+def propose(scene: Scene, density_fn: Callable, around: Surroundings, options: Options):
+    """Draws and judges candidate poses.
+
+    Args:
+      scene: the capture.
+      density_fn: points [K, 3] -> density [K], scene units.
+      around: from `look_around`.
+      options: what the user asked for.
+
+    Returns:
+      `Proposals`.
+
+    Raises:
+      PlacementError: fewer than `options.num_views` are left.
+      SceneError: the file of poses cannot be used.
+    """
+
+    def judge(poses):
+        positions = poses[:, :, 3]
+        inside, near = judge_positions(
+            positions,
+            density_fn,
+            clearance=around.clearance,
+            solid_density=around.solid_density,
+        )
+        in_bounds = within_bounds(around.to_user(positions), options.bounds)
+        # The first reason counts, in the order of `clearance.REASONS`.
+        return np.select([~in_bounds, inside, near], [0, 1, 2], -1)
+
+    draw = _make_draw_fn(scene, around, options)
+    wanted = options.num_candidates
+    if options.candidates == "file":
+        wanted = max(wanted, len(draw(0)))
+    proposals = collect_poses(draw, judge, wanted)
+    check_enough(proposals, options.num_views, fixes=FIXES)
+    return proposals
+
+
+def photos_in_matter(scene: Scene, density_fn: Callable, around: Surroundings) -> int:
+    """How many photos the same test would turn away: where not 0, the field has fog or floaters."""
+    positions = np.asarray(scene.cameras.positions)
+    inside, _ = judge_positions(
+        positions, density_fn, clearance=around.clearance, solid_density=around.solid_density
+    )
+    return int(inside.sum())
+
+
+def candidate_cameras(scene: Scene, poses) -> Cameras:
+    """The poses as cameras with the lens of a photo whose image size is the commonest."""
+    sizes, which = np.unique(np.asarray(scene.cameras.sizes), axis=0, return_inverse=True)
+    first = int(np.argmax(which == np.bincount(which, minlength=len(sizes)).argmax()))
+    one = take(jax.tree.map(np.asarray, scene.cameras), np.array([first]))
+    cameras = jax.tree.map(lambda x: np.repeat(x, len(poses), axis=0), one)
+    return cameras.replace(world_from_cam=np.asarray(poses, np.float32))
+
+
+def _make_draw_fn(scene: Scene, around: Surroundings, options: Options) -> Callable:
+    """Lap number -> poses [n, 3, 4] in scene coordinates."""
+    cameras = np.asarray(scene.cameras.world_from_cam, np.float64)
+    num, up = options.num_candidates, scene.up
+
+    def shell(rng, lap):
+        positions, pairs = shell_positions(
+            rng, num, cameras[:, :, 3], focus=around.focus, up=up, spread=options.spread
+        )
+        targets = np.broadcast_to(around.focus, positions.shape)
+        if not around.faces_focus:
+            # Photos that look outwards have nothing in common to look at.
+            targets = positions - around.distance * cameras[pairs, :, 2].mean(axis=1)
+        return aim(positions, turned_targets(rng, positions, targets, options.gaze_jitter), up)
+
+    def hemisphere(rng, lap):
+        key = jax.random.fold_in(jax.random.key(options.seed), lap)
+        return hemisphere_poses(key, num, centre=around.focus, radius=around.distance, up=up)
+
+    def box(rng, lap):
+        positions = around.to_scene(box_positions(rng, num, options.bounds))
+        targets = np.broadcast_to(around.focus, positions.shape)
+        return aim(positions, turned_targets(rng, positions, targets, options.gaze_jitter), up)
+
+    def file(rng, lap):
+        poses = read_pose_file(options.poses_file) if lap == 0 else np.zeros((0, 3, 4))
+        return transform_poses(np.linalg.inv(around.user_from_scene), poses)
+
+    draw_lap = {"shell": shell, "hemisphere": hemisphere, "box": box, "file": file}
+    chosen = draw_lap[options.candidates]
+    return lambda lap: chosen(np.random.default_rng([options.seed, lap]), lap)

@@ -1,0 +1,310 @@
+"""From a suggestion to its files: order, rows, exports and the page."""
+
+from __future__ import annotations
+
+import pathlib
+
+import numpy as np
+
+from bavs_jax.cameras import Cameras, take
+from bavs_jax.placement.collect import Proposals
+from bavs_jax.rendering.images import render_views
+from bavs_jax.scenes.poses import user_transforms
+from bavs_jax.selection.route import route_length, shortest_route
+from bavs_jax.uncertainty.scoring import reduced_cameras
+from experiments.build import RENDER_CHUNK, Problem
+from experiments.files import write_json
+from experiments.progress import track
+from experiments.suggest import exports, page, plots
+from experiments.suggest.choosing import Suggestion, photo_rays
+from experiments.suggest.facts import length, pose_facts
+from experiments.suggest.places import Surroundings, photos_in_matter
+from experiments.suggest.settings import Options
+
+MANY_IN_MATTER = 0.1  # share of the photos inside of "matter" from which the page warns
+
+
+def visiting_order(places, options: Options, last_photo) -> tuple[np.ndarray, str]:
+    """The order of the files, as indices of the picks, and the route in words.
+
+    Args:
+      places: [k, 3] chosen places in the user's coordinates.
+      options: whether a route is wanted, and from where.
+      last_photo: [3] where it begins if `options.start` is None.
+    """
+    if not options.route:
+        return np.arange(len(places)), ""
+    start = last_photo if options.start is None else options.start
+    order = shortest_route(start, places)
+    found = route_length(start, places, order)
+    before = route_length(start, places, np.arange(len(places)))
+    origin = "the last photo" if options.start is None else "the given start"
+    words = (
+        f"The poses are numbered along a route of {length(found)} from {origin} "
+        f"({', '.join(f'{x:.3g}' for x in start)}); in the order of picking it would be "
+        f"{length(before)}."
+    )
+    return order, words
+
+
+def make_rows(suggestion: Suggestion, order) -> list[dict]:
+    """What the files say of each pose, in their order."""
+    picked, first = suggestion.worth.picked, suggestion.worth.picked[0]
+    return [
+        {
+            "order": place + 1,
+            "picked": int(pick) + 1,
+            "score": float(suggestion.scores[suggestion.selected[pick]]),
+            "share_of_first": float(picked[pick] / first) if first > 0.0 else None,
+        }
+        for place, pick in enumerate(order)
+    ]
+
+
+def render_previews(problem: Problem, train, jac_sq_sum, cameras: Cameras) -> list[dict]:
+    """Colour, opacity and uncertainty of the chosen poses."""
+    render = problem.render(train, jac_sq_sum, photo_rays(problem))
+    num_rays = int(np.prod(np.asarray(cameras.sizes), axis=-1).sum())
+    with track(num_rays, f"render {len(cameras)} previews", "rays") as bar:
+        return render_views(
+            render, cameras, np.arange(len(cameras)), chunk=RENDER_CHUNK, progress_fn=bar.advance
+        )
+
+
+def photo_levels(problem: Problem, train, jac_sq_sum, scale: float):
+    """Uncertainty of the photos' pixels, and the median of their scores, at the reduced size."""
+    small = reduced_cameras(take(problem.scene.cameras, problem.scene.pool), scale)
+    render = problem.render(train, jac_sq_sum, photo_rays(problem))
+    num_rays = int(np.prod(np.asarray(small.sizes), axis=-1).sum())
+    with track(num_rays, f"score the {len(small)} photos", "rays") as bar:
+        images = render_views(
+            lambda rays: {"uncertainty": render(rays)["uncertainty"]},
+            small,
+            np.arange(len(small)),
+            chunk=RENDER_CHUNK,
+            progress_fn=bar.advance,
+        )
+    scores = [float(image["uncertainty"].mean()) for image in images]
+    pixels = np.concatenate([image["uncertainty"].ravel() for image in images])
+    return pixels, float(np.median(scores))
+
+
+def write_results(
+    folder: pathlib.Path,
+    *,
+    problem: Problem,
+    train,
+    jac_sq_sum,
+    around: Surroundings,
+    proposals: Proposals,
+    cameras: Cameras,
+    suggestion: Suggestion,
+    options: Options,
+    quality: dict | None,
+    command: str,
+    seconds_fn,
+) -> dict[str, pathlib.Path]:
+    """Writes poses, numbers and the page.
+
+    Args:
+      folder: the working folder.
+      problem, train, jac_sq_sum: the field and the curvature of the photos.
+      around, proposals, cameras: where candidates came from, and the C of them.
+      suggestion: the choice among them.
+      options: what the user asked for.
+      quality: measures on photos that were left out, or None.
+      command: how the script was called.
+      seconds_fn: () -> seconds since the script began.
+
+    Returns:
+      The files by name.
+    """
+    scene = problem.scene
+
+    def density_fn(positions):
+        return problem.density(train, positions)
+
+    user_poses = user_transforms(scene, cameras.world_from_cam)
+    photo_places = around.to_user(np.asarray(scene.cameras.positions))
+    places = user_poses[suggestion.selected][:, :3, 3]
+    order, route_words = visiting_order(places, options, photo_places[-1])
+    rows = make_rows(suggestion, order)
+    chosen = suggestion.selected[order]
+    picked_cameras, poses = take(cameras, chosen), user_poses[chosen]
+
+    files = {
+        "poses": folder / "next_views" / "transforms.json",
+        "camera path": folder / "next_views" / "camera_path.json",
+        "table": folder / "next_views" / "next_views.csv",
+        "report": folder / "report.html",
+    }
+    exports.write_transforms(files["poses"], poses, picked_cameras, rows)
+    exports.write_camera_path(files["camera path"], poses, picked_cameras)
+    # nerfstudio renders a camera path in the coordinates of its own normalisation, which are the
+    # scene's: levelled, centred and scaled as by its defaults.
+    normalised = files["camera path"].with_name("camera_path_normalised.json")
+    scene_poses = np.tile(np.eye(4), (len(chosen), 1, 1))
+    scene_poses[:, :3] = picked_cameras.world_from_cam
+    exports.write_camera_path(normalised, scene_poses, picked_cameras)
+    exports.write_csv(files["table"], poses, rows)
+
+    pixels, photo_level = photo_levels(problem, train, jac_sq_sum, options.score_scale)
+    images = render_previews(problem, train, jac_sq_sum, picked_cameras)
+    facts = pose_facts(
+        scene,
+        around,
+        picked_cameras,
+        images,
+        photo_uncertainty=pixels,
+        density_fn=density_fn,
+    )
+    worth_words = page.worth_sentence(suggestion.worth, photo_level)
+    foggy = photos_in_matter(scene, density_fn, around)
+    _write_summary(folder / "suggestion.json", suggestion, proposals, rows, facts, worth_words)
+
+    cards_rows = [row | {"place": _place_words(pose)} for row, pose in zip(rows, poses)]
+    cards, bar = page.preview_cards(images, cards_rows, [f.sentence() for f in facts])
+    start = options.start if options.start is not None else photo_places[-1]
+    width, height = (int(n) for n in picked_cameras.sizes[0])
+    portrait = height > width
+    page.write_page(
+        files["report"],
+        title=scene.name,
+        headline=_headline(scene, suggestion, proposals),
+        worth=worth_words,
+        warnings=_warnings(scene, around, facts, foggy),
+        route=route_words,
+        cards=cards,
+        bar=bar,
+        card_columns="1fr 1fr 1.6fr" if portrait else "1fr 1fr",
+        words_place="" if portrait else "grid-column: 1 / -1;",
+        place=plots.place_plot(
+            axes=plots.levelled_axes(scene.up, np.asarray(scene.cameras.positions), around.focus),
+            unit=around.unit,
+            focus=around.focus,
+            photos=np.asarray(scene.cameras.world_from_cam, np.float64),
+            candidates=np.asarray(cameras.world_from_cam, np.float64),
+            scores=suggestion.scores,
+            selected=chosen,
+            order=options.route,
+            start=around.to_scene(start) if options.route else None,
+        ),
+        candidates=_candidate_words(options, proposals, suggestion, around),
+        worth_curve=plots.worth_plot(
+            suggestion.worth, float(suggestion.worth.picked[0]), photo_level
+        ),
+        table=_table(rows, poses, facts),
+        command=command,
+        details=_details(problem, options, around, quality, foggy, seconds_fn()),
+    )
+    return files
+
+
+def _headline(scene, suggestion: Suggestion, proposals: Proposals) -> str:
+    num, total = len(suggestion.selected), len(proposals.poses)
+    poses = "pose" if num == 1 else "poses"
+    return (
+        f"The {num} {poses} to photograph next, chosen from {total} free places around "
+        f"{scene.num_views} photos."
+    )
+
+
+def _warnings(scene, around: Surroundings, facts, foggy: int) -> list[str]:
+    words = []
+    if foggy > MANY_IN_MATTER * scene.num_views:
+        words.append(
+            f"{foggy} of {scene.num_views} photos stand in what the field takes for matter: it has "
+            "fog in front of the cameras, so free places are turned away too. Train longer "
+            "(--train_steps)."
+        )
+    unseen = sum(f.num_seeing == 0 for f in facts)
+    if unseen:
+        words.append(
+            f"{unseen} of {len(facts)} poses stand where no photo looks. What the field says of "
+            "such places is a guess: make sure that they are free before you send a robot there."
+        )
+    if not around.faces_focus:
+        words.append(
+            "The photos look outwards, so that they have no common point in front of them: shell "
+            "candidates look where the photos near them look."
+        )
+    return words
+
+
+def _candidate_words(options, proposals, suggestion, around: Surroundings) -> str:
+    words = (
+        f"Candidates ({options.candidates}): {proposals.in_words()}. Matter: half of the light "
+        f"lost within {length(np.log(2.0) / around.solid_density * around.unit)}; clearance "
+        f"{length(around.clearance * around.unit)}."
+    )
+    if suggestion.info.filter is not None:
+        words += (
+            f" The distance filter of {options.policy!r} left "
+            f"{int(suggestion.info.survivors.sum())}, at least "
+            f"{length(float(suggestion.info.filter.radii.min_train_distance) * around.unit)} from "
+            "every photo and from each other."
+        )
+    return words
+
+
+def _place_words(pose: np.ndarray) -> str:
+    place = ", ".join(f"{x:.3f}" for x in pose[:3, 3])
+    look = ", ".join(f"{x:.2f}" for x in -pose[:3, 2])
+    return f"at ({place}), looks along ({look})"
+
+
+def _table(rows, poses, facts) -> dict:
+    head = ("no.", "picked", "x", "y", "z", "score", "share of first", "high pixels")
+    head += ("nearest photo", "photos that see the place")
+    cells = [
+        [
+            str(row["order"]),
+            str(row["picked"]),
+            *(f"{x:.3f}" for x in pose[:3, 3]),
+            f"{row['score']:.3f}",
+            "—" if row["share_of_first"] is None else f"{row['share_of_first']:.0%}",
+            f"{fact.share_high:.0%}",
+            f"{fact.nearest_distance:.3g}",
+            str(fact.num_seeing),
+        ]
+        for row, pose, fact in zip(rows, poses, facts)
+    ]
+    return {"head": head, "rows": cells}
+
+
+def _details(problem, options, around: Surroundings, quality, foggy, seconds) -> list[tuple]:
+    scene = problem.scene
+    width, height = np.asarray(scene.cameras.sizes).max(axis=0)
+    measured = "not measured: no photo was left out (--holdout)"
+    if quality is not None:
+        measured = (
+            f"PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.3f} on "
+            f"{quality['num_test_views']} photos left out"
+        )
+    focus = ", ".join(f"{x:.3f}" for x in around.to_user(around.focus))
+    return [
+        ("photos", f"{len(scene.pool)} to train on, at most {width} x {height} pixels"),
+        ("field", measured),
+        ("policy", options.policy),
+        ("focus", f"({focus}), {length(around.distance * around.unit)} from the photos (median)"),
+        ("photos inside of matter", f"{foggy} of {scene.num_views}"),
+        ("time", f"{seconds:.0f} s"),
+    ]
+
+
+def _write_summary(path, suggestion: Suggestion, proposals, rows, facts, worth_words) -> None:
+    worth, first = suggestion.worth, suggestion.worth.picked[0]
+    left = [None if np.isnan(x) else float(x) for x in worth.best_left]
+    value = {
+        "drawn": proposals.num_drawn,
+        "kept": len(proposals.poses),
+        "dropped": proposals.dropped,
+        "first_score": float(first),
+        "best_left": left,
+        "worth": worth_words,
+        "views": [
+            row | {"share_high": fact.share_high, "why": fact.sentence()}
+            for row, fact in zip(rows, facts)
+        ],
+    }
+    write_json(path, value)

@@ -1,0 +1,98 @@
+"""One field on all photos of a capture, with its curvature; both survive a kill."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bavs_jax.active import init_active_state
+from bavs_jax.scenes import Scene, SceneError
+from bavs_jax.training.checkpoints import Checkpoints
+from bavs_jax.training.train import TrainState
+from bavs_jax.uncertainty.streaming import training_pixels
+from experiments.build import Problem, run_key
+from experiments.evaluate import evaluate_views, spread_evenly
+from experiments.files import write_arrays
+from experiments.progress import track
+
+
+def all_for_training(scene: Scene, holdout: int) -> Scene:
+    """The scene with every view in the pool, but for `holdout` evenly spaced ones that are only
+    measured."""
+    views = np.arange(scene.num_views, dtype=np.int32)
+    if not 0 <= holdout <= scene.num_views - 2:
+        raise SceneError(
+            f"{scene.name}: --holdout={holdout} of {scene.num_views} photos leaves fewer than 2 "
+            "to train on: give a smaller number"
+        )
+    test = spread_evenly(views, holdout) if holdout else views[:0]
+    return dataclasses.replace(scene, pool=np.setdiff1d(views, test), test=test)
+
+
+def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> TrainState:
+    """Trains, going on from the last checkpoint in `folder`.
+
+    Raises:
+      FloatingPointError: the loss is not finite.
+    """
+    pool, steps = problem.scene.pool, config.train.steps_per_call
+    checkpoints = Checkpoints(folder / "checkpoints", keep=1)
+    init_key = jax.random.fold_in(run_key(seed), 2**31 - 1)
+    state = init_active_state(problem.init_train(init_key), problem.table, pool)
+    if checkpoints.latest() is not None:
+        saved, meta = checkpoints.restore(state.train)
+        state = state.replace(train=saved, calls=jnp.int32(meta["calls"]))
+    left = problem.calls_per_round - int(state.calls)
+    if left > 0:
+        saved_at = time.monotonic()
+        with track(left * steps, f"train on {len(pool)} photos", "steps") as bar:
+
+            def on_call(state, info):
+                nonlocal saved_at
+                loss = float(info.loss)
+                bar.advance(steps, loss=loss, psnr=-10.0 * np.log10(loss))
+                calls = int(state.calls)
+                due = time.monotonic() - saved_at > config.checkpoint_seconds
+                if due or calls == problem.calls_per_round:
+                    checkpoints.save(calls, state.train, {"calls": calls})
+                    saved_at = time.monotonic()
+
+            step = problem.make_step("bavs", pool, track, "suggest")
+            state, _ = step(run_key(seed), state, None, on_call)
+    checkpoints.close()
+    return state.train
+
+
+def photo_curvature(config, problem: Problem, train: TrainState, folder: pathlib.Path, seed: int):
+    """`jac_sq_sum` [G, 3] of all training photos (Eq 13), kept in `folder` once it is made."""
+    path = folder / "curvature.npz"
+    if path.exists():
+        with np.load(path) as data:
+            return jnp.asarray(data["jac_sq_sum"])
+    is_training = np.zeros(len(problem.table.cameras), bool)
+    is_training[problem.scene.pool] = True
+    view_ids, within = training_pixels(problem.table, is_training)
+    scale, most = 1.0, config.uncertainty.max_rays
+    if most and len(view_ids) > most:
+        rows = np.sort(np.random.default_rng(seed).permutation(len(view_ids))[:most])
+        scale = len(view_ids) / most
+        view_ids, within = view_ids[rows], within[rows]
+    with track(len(view_ids), "curvature of the photos", "rays") as bar:
+        jac_sq_sum = scale * problem.curvature(train, problem.table, view_ids, within, bar.advance)
+    write_arrays(path, jac_sq_sum=np.asarray(jac_sq_sum))
+    return jac_sq_sum
+
+
+def holdout_quality(problem: Problem, train: TrainState) -> dict | None:
+    """Image measures on the photos that were left out, or None if none were."""
+    scene = problem.scene
+    if not len(scene.test):
+        return None
+    num_rays = int(np.diff(scene.offsets)[scene.test].sum())
+    with track(num_rays, f"measure on {len(scene.test)} photos left out", "rays") as bar:
+        return evaluate_views(problem.render(train), scene, scene.test, progress_fn=bar.advance)

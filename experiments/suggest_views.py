@@ -1,0 +1,152 @@
+"""Where to stand next: proposes camera poses for a capture that has no candidate images.
+
+    python -m experiments.suggest_views --data=FOLDER --num_views=10 --workdir=runs/suggestion
+
+Trains a field on every photo, estimates its uncertainty, and chooses among free poses that are
+clear of matter and within bounds. Poses are written in the coordinates of the user's own files.
+The same command goes on with a run that was stopped; with other candidates it uses the same field.
+"""
+
+from __future__ import annotations
+
+import pathlib
+import sys
+import time
+
+from absl import flags
+from ml_collections import config_flags
+
+from bavs_jax.placement.collect import PlacementError
+from bavs_jax.scenes import SceneError, load_scene
+from bavs_jax.selection.context import SelectionError
+from experiments import runtime, workdir
+from experiments.build import ConfigError, build_problem
+from experiments.suggest import choosing, places, results, settings, training
+
+FLAGS = flags.FLAGS
+flags.DEFINE_string("data", None, "Folder of the capture, in any layout that can be loaded.")
+flags.DEFINE_string("workdir", None, "Folder for poses, checkpoints and report.html.")
+flags.DEFINE_integer("num_views", 10, "How many poses to propose.")
+flags.DEFINE_string("policy", "bavs", "Acquisition policy that chooses.")
+flags.DEFINE_integer("holdout", 0, "Photos left out of training, to measure the field on.")
+flags.DEFINE_string("loader", "auto", "Layout of the folder; auto: by the files in it.")
+flags.DEFINE_integer("image_size", 135, "Width in pixels to which the widest photo is reduced.")
+flags.DEFINE_integer("train_steps", 3000, "Optimiser steps of the field.")
+config_flags.DEFINE_config_dict(
+    "config",
+    settings.default_config(),
+    "Every other option of the field and its uncertainty, as --config.name=value; they are "
+    "explained in experiments/configs/base.py.",
+)
+flags.DEFINE_integer("seed", 0, "Of everything that is drawn.")
+flags.DEFINE_enum("candidates", "shell", settings.KINDS, "Where a camera could stand.")
+flags.DEFINE_integer("num_candidates", 150, "Poses to choose from.")
+flags.DEFINE_string("bounds", "", "x0,y0,z0,x1,y1,z1 in user coordinates; no pose is outside.")
+flags.DEFINE_string("poses_file", "", "JSON or CSV of reachable poses, for --candidates=file.")
+flags.DEFINE_float("clearance", 0.0, "Free radius around a camera in user units; 0: 5 %.")
+flags.DEFINE_float("spread", 0.25, "How far the shell goes beyond the photos, as a share.")
+flags.DEFINE_float("gaze_jitter", 8.0, "Degrees by which shell and box poses look aside.")
+flags.DEFINE_float("score_scale", 0.25, "Size of the images that are scored, as a share.")
+flags.DEFINE_bool("route", False, "Order the poses along a short route.")
+flags.DEFINE_string("start", "", "x,y,z where the route begins; default: at the last photo.")
+flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
+
+
+def read_options() -> settings.Options:
+    """The flags as options, checked.
+
+    Raises:
+      PlacementError: a value that cannot be used.
+    """
+    options = settings.Options(
+        num_views=FLAGS.num_views,
+        policy=FLAGS.policy,
+        candidates=FLAGS.candidates,
+        num_candidates=FLAGS.num_candidates,
+        bounds=settings.parse_bounds(FLAGS.bounds),
+        poses_file=FLAGS.poses_file,
+        clearance=FLAGS.clearance,
+        spread=FLAGS.spread,
+        gaze_jitter=FLAGS.gaze_jitter,
+        score_scale=FLAGS.score_scale,
+        route=FLAGS.route,
+        start=settings.parse_numbers(FLAGS.start, 3, "start"),
+        seed=FLAGS.seed,
+    )
+    settings.check_options(options)
+    choosing.check_policy(options.policy)
+    return options
+
+
+def suggest_views(data: pathlib.Path, folder: pathlib.Path, options: settings.Options) -> None:
+    """Trains, proposes, chooses and writes."""
+    begin = time.monotonic()
+    config = FLAGS.config
+    config.loader, config.image_size = FLAGS.loader, FLAGS.image_size
+    config.holdout, config.train.num_steps = FLAGS.holdout, FLAGS.train_steps
+    settings.name_scene(config, data)
+    scene = load_scene(FLAGS.loader, root=data, image_size=FLAGS.image_size)
+    scene = training.all_for_training(scene, FLAGS.holdout)
+    folder.mkdir(parents=True, exist_ok=True)
+    workdir.claim(folder, config)
+    around = places.look_around(scene, options)
+    print(f"{scene.name}: {len(scene.pool)} photos to train on, {len(scene.test)} left out")
+
+    problem = build_problem(config, scene)
+    field_folder = folder / "field" / f"seed_{options.seed}"
+    train = training.train_field(config, problem, field_folder, options.seed)
+    jac_sq_sum = training.photo_curvature(config, problem, train, field_folder, options.seed)
+    quality = training.holdout_quality(problem, train)
+
+    proposals = places.propose(
+        scene, lambda positions: problem.density(train, positions), around, options
+    )
+    print(f"candidates ({options.candidates}): {proposals.in_words()}")
+    cameras = places.candidate_cameras(scene, proposals.poses)
+    suggestion = choosing.suggest(
+        problem,
+        train,
+        jac_sq_sum,
+        cameras,
+        policy=options.policy,
+        num_views=options.num_views,
+        centre=around.focus,
+        scale=options.score_scale,
+        seed=options.seed,
+    )
+    files = results.write_results(
+        folder,
+        problem=problem,
+        train=train,
+        jac_sq_sum=jac_sq_sum,
+        around=around,
+        proposals=proposals,
+        cameras=cameras,
+        suggestion=suggestion,
+        options=options,
+        quality=quality,
+        command=runtime.command_line(),
+        seconds_fn=lambda: time.monotonic() - begin,
+    )
+    for name, path in files.items():
+        print(f"{name + ':':13}{path}")
+    print(f"({time.monotonic() - begin:.0f} s in all)")
+
+
+def main() -> None:
+    for name, hint in (("data", "folder of the capture"), ("workdir", "folder for the results")):
+        if not FLAGS[name].value:
+            sys.exit(f"error: --{name}: is missing; name a {hint}")
+    if FLAGS.compilation_cache:
+        runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
+    try:
+        suggest_views(pathlib.Path(FLAGS.data), pathlib.Path(FLAGS.workdir), read_options())
+    except (
+        *(SceneError, SelectionError, ConfigError, PlacementError, workdir.WorkdirError),
+        FloatingPointError,
+    ) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    runtime.run_script(main)

@@ -1,0 +1,319 @@
+"""Where to stand next: options, files in the user's coordinates, the script on a tiny capture."""
+
+import csv
+import dataclasses
+import json
+import math
+import os
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bavs_jax.cameras import make_cameras
+from bavs_jax.placement.collect import PlacementError
+from bavs_jax.scenes.poses import user_transforms
+from bavs_jax.selection.context import SelectionError
+from bavs_jax.selection.policies import POLICIES
+from bavs_jax.selection.worth import Worth
+from experiments.suggest import choosing, exports, facts, page, places, settings
+from tests.scene_files import orbit, write_nerfstudio
+from tests.toy_scenes import toy_scene
+
+ROOT = pathlib.Path(__file__).parents[1]
+
+
+def options(**changes) -> settings.Options:
+    given = settings.Options(
+        num_views=3,
+        policy="bavs",
+        candidates="shell",
+        num_candidates=20,
+        bounds=None,
+        poses_file="",
+        clearance=0.0,
+        spread=0.25,
+        gaze_jitter=5.0,
+        score_scale=0.5,
+        route=False,
+        start=None,
+        seed=0,
+    )
+    return dataclasses.replace(given, **changes)
+
+
+def similar_scene():
+    """The toy scene as if its user's files were turned, three times as large and elsewhere."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = 3.0 * Rotation.from_euler("xyz", [20, -40, 110], degrees=True).as_matrix()
+    matrix[:3, 3] = [10.0, -5.0, 2.0]
+    return dataclasses.replace(toy_scene(), user_from_scene=matrix)
+
+
+def ball(points):
+    return np.where(np.linalg.norm(points, axis=-1) < 0.7, 100.0, 0.0)
+
+
+# --- options ---
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"num_views": 0}, "--num_views"),
+        ({"num_candidates": 2}, "--num_candidates"),
+        ({"candidates": "box"}, "--bounds: is missing"),
+        ({"candidates": "file"}, "--poses_file"),
+        ({"poses_file": "a.csv"}, "--poses_file"),
+        ({"start": np.zeros(3)}, "--start"),
+        ({"score_scale": 0.0}, "--score_scale"),
+        ({"gaze_jitter": 91.0}, "--gaze_jitter"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(changes, message):
+    with pytest.raises(PlacementError, match=message):
+        settings.check_options(options(**changes))
+    settings.check_options(options())
+
+
+@pytest.mark.parametrize("text", ["1,2", "1,2,3,4,5,x", "1,2,3,0,5,6", "1,2,3,4,5,nan"])
+def test_bounds_that_are_no_box_are_refused(text):
+    with pytest.raises(PlacementError, match="--bounds"):
+        settings.parse_bounds(text)
+    np.testing.assert_array_equal(settings.parse_bounds("0,1,2, 3,4,5"), [[0, 1, 2], [3, 4, 5]])
+    assert settings.parse_bounds("") is None
+
+
+# --- candidates in the user's coordinates ---
+
+
+def test_points_go_to_the_user_and_back():
+    around = places.look_around(similar_scene(), options())
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    np.testing.assert_allclose(around.to_scene(around.to_user(points)), points, atol=1e-12)
+    np.testing.assert_allclose(around.unit, 3.0)
+
+
+@pytest.mark.parametrize("kind", ["shell", "hemisphere", "box"])
+def test_candidates_stay_within_the_users_bounds_and_out_of_the_ball(kind):
+    scene = similar_scene()
+    middle = places.look_around(scene, options()).to_user(np.zeros(3))
+    bounds = np.stack([middle - 9.0, middle + np.array([9.0, 9.0, 7.0])])
+    chosen = options(candidates=kind, bounds=bounds, clearance=0.9, num_candidates=600)
+    around = places.look_around(scene, chosen)
+    got = places.propose(scene, ball, around, chosen)
+    user = user_transforms(scene, got.poses)[:, :3, 3]
+    assert len(got.poses) == 600
+    assert (user >= bounds[0] - 1e-9).all() and (user <= bounds[1] + 1e-9).all()
+    # The ball's radius and the clearance of 0.9 user units, in scene units.
+    assert np.linalg.norm(got.poses[:, :, 3], axis=-1).min() >= 0.7 + 0.3 - 1e-6
+    if kind == "box":
+        assert got.dropped["inside matter"] > 0 and got.dropped["too near to matter"] > 0
+    rotations = got.poses[:, :, :3]
+    np.testing.assert_allclose(
+        rotations @ rotations.transpose(0, 2, 1),
+        np.broadcast_to(np.eye(3), rotations.shape),
+        atol=1e-5,  # hemisphere poses are float32
+    )
+
+
+def test_poses_from_a_file_are_read_in_the_users_coordinates(tmp_path):
+    scene = similar_scene()
+    user = user_transforms(scene, np.asarray(scene.cameras.world_from_cam)[:5])
+    (tmp_path / "reach.json").write_text(json.dumps(user.tolist()))
+    chosen = options(candidates="file", poses_file=str(tmp_path / "reach.json"))
+    got = places.propose(scene, ball, places.look_around(scene, chosen), chosen)
+    np.testing.assert_allclose(got.poses, scene.cameras.world_from_cam[:5], atol=1e-5)
+    assert got.num_drawn == 5
+    with pytest.raises(PlacementError, match="list more poses"):
+        more = dataclasses.replace(chosen, num_views=6)
+        places.propose(scene, ball, places.look_around(scene, more), more)
+
+
+# --- facts ---
+
+
+def test_bearing_is_that_of_someone_who_faces_the_focus():
+    scene = toy_scene()
+    around = dataclasses.replace(places.look_around(scene, options()), focus=np.zeros(3))
+    photos = np.array([[0.0, -3.0, 0.0]])  # stands in the south, looks north: left is west
+    assert "90° to the left" in facts.bearing(np.array([-3.0, 0, 0]), photos, around, (0, 0, 1))
+    words = facts.bearing(np.array([1.5, -1.5, 1.5 * math.sqrt(2)]), photos, around, (0, 0, 1))
+    assert "45° to the right" in words and "45° above" in words
+    all_around = np.array([[3.0, 0, 0], [-3, 0, 0], [0, 3, 0], [0, -3, 0]])
+    assert "all around" in facts.bearing(np.array([1.0, 0, 0]), all_around, around, (0, 0, 1))
+
+
+def test_where_high_pixels_gather():
+    high = np.zeros((9, 12), bool)
+    assert facts.gathered_where(high) is None
+    high[7:, :3] = True
+    assert facts.gathered_where(high) == "lower left"
+    assert facts.gathered_where(np.ones((9, 12), bool)) is None
+
+
+def test_photos_see_what_is_before_them_and_not_behind_the_ball():
+    scene = toy_scene()  # cameras at azimuths 0, 30, ... of the pool of 9
+    beside = np.array([0.0, 0.0, 0.95])  # above the ball, in sight of every photo
+    behind = np.asarray(scene.cameras.positions)[0] * 5.0
+    assert facts.count_seeing(scene, beside, ball) == len(scene.pool)
+    assert facts.count_seeing(scene, np.zeros(3), ball) == 0
+    direction = -np.asarray(scene.cameras.positions)[0]
+    shadow = 0.75 * direction / np.linalg.norm(direction)  # hidden from photo 0 by the ball
+    assert 0 < facts.count_seeing(scene, shadow, ball) < len(scene.pool)
+    assert facts.count_seeing(scene, behind, ball) < len(scene.pool)
+
+
+def test_worth_in_words():
+    worth = Worth(np.array([0.6, 0.5]), np.array([0.6, 0.55, 0.45]))
+    words = page.worth_sentence(worth, 0.4)
+    assert "75% of the first" in words and "25% of the first pick:" in words
+    assert "no more than the median photo" in page.worth_sentence(worth, 0.7)
+    assert "No candidate is left" in page.worth_sentence(
+        Worth(np.array([0.6]), np.array([0.6, np.nan])), 0.4
+    )
+
+
+# --- files ---
+
+
+@pytest.fixture
+def written(tmp_path):
+    poses = np.array(orbit(3))
+    cameras = make_cameras(
+        poses, np.tile([30.0, 32.0, 19.5, 30.5], (3, 1)), np.tile([40, 60], (3, 1)),
+        distortion=np.tile([0.1, 0, 0, 0, 0, 0.02], (3, 1)), lens="opencv",
+    )  # fmt: skip
+    rows = [
+        {"order": i + 1, "picked": 3 - i, "score": 0.5, "share_of_first": 0.25 * i}
+        for i in range(3)
+    ]
+    exports.write_transforms(tmp_path / "transforms.json", poses, cameras, rows)
+    exports.write_camera_path(tmp_path / "camera_path.json", poses, cameras)
+    exports.write_csv(tmp_path / "next_views.csv", poses, rows)
+    return tmp_path, poses
+
+
+def test_transforms_parse_back(written):
+    folder, poses = written
+    data = json.loads((folder / "transforms.json").read_text())
+    assert data["camera_model"] == "OPENCV"
+    np.testing.assert_allclose([f["transform_matrix"] for f in data["frames"]], poses)
+    first = data["frames"][0]
+    np.testing.assert_allclose([first[k] for k in ("k1", "p2", "fl_y", "h")], [0.1, 0.02, 32, 60])
+
+
+def test_camera_path_has_the_viewers_form(written):
+    folder, poses = written
+    data = json.loads((folder / "camera_path.json").read_text())
+    assert {"camera_type", "render_height", "render_width", "fps", "seconds"} <= data.keys()
+    assert data["camera_type"] == "perspective" and data["is_cycle"] is False
+    for view, pose in zip(data["camera_path"], poses, strict=True):
+        np.testing.assert_allclose(np.reshape(view["camera_to_world"], (4, 4)), pose)
+        # nerfstudio: focal = height / 2 / tan(fov / 2), fov vertical in degrees.
+        focal = 0.5 * data["render_height"] / math.tan(math.radians(view["fov"]) / 2)
+        np.testing.assert_allclose([focal, view["aspect"]], [32.0, 40 / 60], rtol=1e-6)
+
+
+def test_csv_parses_back(written):
+    folder, poses = written
+    with open(folder / "next_views.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    for row, pose in zip(rows, poses, strict=True):
+        place = [float(row[k]) for k in ("x", "y", "z")]
+        quaternion = [float(row[k]) for k in ("qx", "qy", "qz", "qw")]
+        np.testing.assert_allclose(place, pose[:3, 3], atol=1e-7)
+        np.testing.assert_allclose(
+            Rotation.from_quat(quaternion).as_matrix(), pose[:3, :3], atol=1e-7
+        )
+        look = [float(row[f"look_{k}"]) for k in "xyz"]
+        np.testing.assert_allclose(look, -pose[:3, 2], atol=1e-7)
+    assert [row["order"] for row in rows] == ["1", "2", "3"]
+
+
+# --- the script ---
+
+SMALL = {
+    "field.num_levels": 2, "field.finest": 32, "field.width": 16, "field.direction_degree": 1,
+    "march.num_steps": 32, "march.num_slots": 16, "march.occupancy_resolution": 16,
+    "train.steps_per_call": 4, "train.num_rays": 64, "train.capacity": 1024,
+    "uncertainty.log2_cells": 3,
+}  # fmt: skip
+
+
+def script(*flags, cache):
+    small = [f"--config.{name}={value}" for name, value in SMALL.items()]
+    return subprocess.run(
+        [sys.executable, "-m", "experiments.suggest_views", *small, *flags],
+        cwd=ROOT,
+        env=os.environ | {"XDG_CACHE_HOME": str(cache)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The script on a capture of 8 noise images, with a route."""
+    base = tmp_path_factory.mktemp("suggest")
+    data = write_nerfstudio(base / "capture", width=24, height=16, fl_x=30.0, fl_y=30.0)
+    flags = [f"--data={data}", f"--workdir={base / 'out'}", "--image_size=24", "--train_steps=16"]
+    flags += ["--num_views=3", "--num_candidates=12", "--score_scale=0.5"]
+    done = script(*flags, "--route", "--start=4,0,1", "--holdout=2", cache=base)
+    assert done.returncode == 0, done.stderr
+    return base, flags, done.stdout
+
+
+def test_script_writes_poses_that_agree_with_each_other(finished):
+    base, _, out = finished
+    folder = base / "out" / "next_views"
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    path = json.loads((folder / "camera_path.json").read_text())["camera_path"]
+    with open(folder / "next_views.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(frames) == len(path) == len(rows) == 3
+    for frame, view, row in zip(frames, path, rows):
+        pose = np.array(frame["transform_matrix"])
+        np.testing.assert_allclose(np.reshape(view["camera_to_world"], (4, 4)), pose)
+        np.testing.assert_allclose([float(row[k]) for k in "xyz"], pose[:3, 3], rtol=1e-6)
+        # The capture is an orbit of radius 4 at height 1 about the origin, which has no noise in
+        # its heights and distances: the shell reaches about the noise beyond.
+        assert 1.5 < np.linalg.norm(pose[:3, 3]) < 7.0
+    assert sorted(int(row["picked"]) for row in rows) == [1, 2, 3]
+    summary = json.loads((base / "out" / "suggestion.json").read_text())
+    assert summary["drawn"] == summary["kept"] + sum(summary["dropped"].values())
+    assert (np.diff(summary["best_left"]) <= 1e-6).all()
+    assert summary["worth"] and all(view["why"] for view in summary["views"])
+    report = (base / "out" / "report.html").read_text()
+    assert report.count("<img") >= 7 and "route of" in report and "PSNR" in report
+    assert "remaining" in out and "dropped" in out
+
+
+def test_same_folder_uses_the_same_field_for_other_candidates(finished):
+    base, flags, _ = finished
+    done = script(*flags, "--holdout=2", "--candidates=box", "--bounds=-6,-6,0.5,6,6,5", cache=base)
+    assert done.returncode == 0, done.stderr
+    assert "train on" not in done.stdout.replace("photos to train on", "")
+    frames = json.loads((base / "out/next_views/transforms.json").read_text())["frames"]
+    places_ = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
+    assert (places_ >= [-6, -6, 0.5]).all() and (places_ <= [6, 6, 5]).all()
+
+
+def test_wrong_folder_ends_in_one_line(finished, tmp_path):
+    base, usual, _ = finished
+    done = script(*usual, f"--workdir={tmp_path}", "--data=/nowhere", cache=base)
+    assert done.returncode != 0 and "/nowhere" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_policy_that_is_unknown_or_needs_more_than_a_curvature_is_refused(monkeypatch):
+    with pytest.raises(SelectionError, match="bavz"):
+        choosing.check_policy("bavz")
+    greedy = POLICIES["bavs"]._replace(needs=frozenset({"curvature", "ensemble"}))
+    monkeypatch.setitem(POLICIES, "bavs", greedy)
+    with pytest.raises(SelectionError, match="needs ensemble"):
+        choosing.check_policy("bavs")
