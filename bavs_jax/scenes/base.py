@@ -35,6 +35,7 @@ class Scene:
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # unit
     depth: np.ndarray | None = None  # [N] float32 distance along the ray, 0 where unknown or empty
     pixel_mask: np.ndarray | None = None  # [N] bool, False: ignore this pixel
+    unbounded: bool = False  # content reaches beyond the box, as in most real captures
     # [4, 4] float64 similarity from scene coordinates to those of the user's own file.
     user_from_scene: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(4))
 
