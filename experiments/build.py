@@ -81,7 +81,11 @@ def load_config_scene(config, *, cache_dir: str | None) -> Scene:
 
 
 def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:
-    """Which views a run starts with: a function of seed and scene alone, never of the policy."""
+    """Which views a run starts with: a function of seed and scene alone, never of the policy.
+
+    A `num` of 0 takes all of the pool.
+    """
+    num = num or len(scene.pool)
     if not 1 <= num <= len(scene.pool):
         raise SceneError(
             f"{scene.name}: num_initial is {num}, but the pool has {len(scene.pool)} views: "

@@ -119,8 +119,8 @@ def make_proposal_sampler(
 
 
 def _anneal(weights, exponent):
-    """`weights^exponent`, and 0 where there is no weight."""
-    return jnp.where(weights > 0, jnp.maximum(weights, 1e-12) ** exponent, 0.0)
+    """`weights^exponent`: 1 everywhere for an exponent of 0, also where there is no weight."""
+    return jnp.maximum(weights, 1e-12) ** exponent
 
 
 def _even_edges(key, num_rays: int, count: int) -> jax.Array:

@@ -15,7 +15,7 @@ def get_config() -> ConfigDict:
     # --- the experiment ---
     config.policies = ("bavs", "random")  # see --list_policies; the first one's views are exported
     config.seeds = (0,)
-    config.num_initial = 4  # views, drawn from the pool by seed and scene alone
+    config.num_initial = 4  # views, drawn from the pool by seed and scene alone; 0: all of them
     config.batch_size = 4  # views chosen at once
     config.num_rounds = 2  # batches after the initial views; 1 is the paper's single iteration
     config.from_scratch = True  # train anew in each round, or train on
@@ -27,7 +27,8 @@ def get_config() -> ConfigDict:
 
     # --- the field and how rays are sampled for it ---
     config.field_kind = "hash_grid"  # a key of build_field.SAMPLERS
-    config.sampler_kind = ""  # "occupancy" or "proposal"; "": what suits field and scene
+    # "occupancy", "proposal" or "coarse_to_fine"; "": what suits field and scene.
+    config.sampler_kind = ""
 
     # --- field_kind "hash_grid" (fields/hash_grid.py) ---
     config.field = ConfigDict()
@@ -40,6 +41,29 @@ def get_config() -> ConfigDict:
     config.field.geometry_features = 15
     config.field.direction_degree = 2  # spherical-harmonics bands, 1 .. 4
     config.field.appearance_features = 0  # of a code for each view trained on; 0: none
+
+    # --- field_kind "nerf_mlp", the paper's own (fields/nerf_mlp.py); 8 x 256 in the paper ---
+    config.nerf_mlp = ConfigDict()
+    config.nerf_mlp.depth = 4
+    config.nerf_mlp.width = 64
+    config.nerf_mlp.skip = 3  # hidden layers before the encoding comes in again; 5 in the paper
+    config.nerf_mlp.position_degree = 8  # octaves; 10 in the paper
+    config.nerf_mlp.direction_degree = 4
+
+    # --- field_kind "mip_mlp": the same over cones, with networks as proposals ---
+    config.mip_mlp = ConfigDict()
+    config.mip_mlp.depth = 4
+    config.mip_mlp.width = 64
+    config.mip_mlp.skip = 3
+    config.mip_mlp.position_degree = 10
+    config.mip_mlp.direction_degree = 4
+    config.mip_mlp.proposal_depth = 2
+    config.mip_mlp.proposal_width = 32
+
+    # --- sampler_kind "coarse_to_fine" (rendering/coarse_to_fine.py); 64 and 128 in the paper ---
+    config.coarse_to_fine = ConfigDict()
+    config.coarse_to_fine.num_coarse = 24
+    config.coarse_to_fine.num_fine = 24
 
     # --- sampler_kind "occupancy" (rendering/sampling.py) ---
     config.march = ConfigDict()
