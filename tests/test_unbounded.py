@@ -246,7 +246,7 @@ def test_proposals_are_not_trusted_at_first():
     sampler, rays = proposal_sampler(), inside_rays()
     params = sampler.init(jax.random.key(0))
     _, aux = jax.jit(sampler.sample)(None, params, sampler.init_state(), rays)
-    np.testing.assert_allclose(np.diff(aux["edges"][-1]), 1 / 13, atol=1e-5)
+    np.testing.assert_allclose(np.diff(aux["edges"][-1]), 1 / 12, atol=1e-5)
 
 
 def test_samples_carry_no_gradient_and_the_loss_teaches_proposals():

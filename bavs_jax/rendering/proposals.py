@@ -74,11 +74,7 @@ def make_proposal_sampler(
             level_key = None if key is None else jax.random.fold_in(key, level)
             # No gradient through where samples lie: proposals learn by the interlevel loss alone.
             trusted = jax.lax.stop_gradient(_anneal(weights, state.anneal) + PADDING)
-            if level == 0:
-                edges = _even_edges(level_key, num_rays, count)
-            else:
-                places = even_places(level_key, num_rays, count + 1)
-                edges = sample_histogram(edges, trusted, places)
+            edges = sample_histogram(edges, trusted, _even_edges(level_key, num_rays, count))
             t_edges = interval.distance(edges)
             samples = dense_samples(
                 0.5 * (t_edges[:, 1:] + t_edges[:, :-1]), jnp.diff(t_edges), interval.is_empty
@@ -124,7 +120,11 @@ def _anneal(weights, exponent):
 
 
 def _even_edges(key, num_rays: int, count: int) -> jax.Array:
-    """Edges [R, count + 1] over all of [0, 1], the inner ones shifted by one jitter a ray."""
+    """Edges [R, count + 1] over all of [0, 1], the inner ones shifted by one jitter a ray.
+
+    Differs from nerfacto, which leaves half an interval out at both ends: what is next to the
+    camera, and what is far behind a surface, would never be looked at.
+    """
     inner = even_places(key, num_rays, count)[:, 1:] - 0.5 / count
     ends = jnp.ones((num_rays, 1))
     return jnp.concatenate([0.0 * ends, inner, ends], axis=-1)
