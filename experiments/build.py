@@ -20,9 +20,7 @@ from bavs_jax.candidates import (
     with_empty_views,
 )
 from bavs_jax.fields.deformation import DeformationGrid
-from bavs_jax.fields.hash_grid import make_hash_grid_field
 from bavs_jax.metrics.perceptual import make_lpips_fn
-from bavs_jax.rendering.sampling import make_march_options
 from bavs_jax.scenes import Scene, SceneError, load_scene
 from bavs_jax.scenes.procedural import capture
 from bavs_jax.selection.distances import Radii
@@ -40,12 +38,10 @@ from bavs_jax.uncertainty.curvature import WEIGHTINGS
 from bavs_jax.uncertainty.posterior import default_prior_weight
 from bavs_jax.uncertainty.scoring import make_render_chunk_fn, mean_uncertainty, reduced_cameras
 from bavs_jax.uncertainty.streaming import make_curvature_fn
+from experiments.build_field import build_field, field_background, learning_rate
+from experiments.errors import ConfigError, check_choice
 
 RENDER_CHUNK = 4096  # rays of one compiled rendering call
-
-
-class ConfigError(ValueError):
-    """An option that cannot be used: one line that names it and the fix."""
 
 
 class Problem(NamedTuple):
@@ -86,7 +82,11 @@ def load_config_scene(config, *, cache_dir: str | None) -> Scene:
 
 
 def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:
-    """Which views a run starts with: a function of seed and scene alone, never of the policy."""
+    """Which views a run starts with: a function of seed and scene alone, never of the policy.
+
+    A `num` of 0 takes all of the pool.
+    """
+    num = num or len(scene.pool)
     if not 1 <= num <= len(scene.pool):
         raise SceneError(
             f"{scene.name}: num_initial is {num}, but the pool has {len(scene.pool)} views: "
@@ -112,8 +112,7 @@ def check_choices(config) -> None:
         ("candidates.source", config.candidates.source, ("dataset", "hemisphere")),
         ("candidates.mode", config.candidates.mode, ("", *MODES)),
     ):
-        if value not in known:
-            raise ConfigError(f"config.{name}: {value!r} is unknown; use one of {known}")
+        check_choice(name, value, known)
 
 
 def build_problem(config, scene: Scene) -> Problem:
@@ -123,53 +122,42 @@ def build_problem(config, scene: Scene) -> Problem:
       ConfigError: an option that cannot be used.
     """
     check_choices(config)
-    field = make_hash_grid_field(scene.box, **config.field)
-    march = config.march
-    march_options = make_march_options(
-        scene.box,
-        near=scene.near,
-        far=scene.far,
-        num_steps=march.num_steps,
-        num_slots=march.num_slots,
-    )
+    table = make_pixel_table(scene)
+    source, table = _make_source(config, scene, table)
+    field, sampler = build_field(config, scene, num_views=len(table.cameras))
+    background = field_background(scene)
     train = config.train
     optimiser, schedule = make_optimiser(
-        learning_rate=train.learning_rate,
+        learning_rate=learning_rate(config),
         final_share=train.final_share,
         num_steps=train.num_steps,
     )
     train_call = make_train_fn(
         field,
+        sampler,
         optimiser,
         schedule,
-        march_options,
-        background=scene.background,
+        background=background,
         num_rays=train.num_rays,
         capacity=train.capacity,
         penalty_weight=train.penalty_weight,
         steps_per_call=train.steps_per_call,
     )
     init_train = jax.jit(
-        partial(
-            init_train_state,
-            field=field,
-            optimiser=optimiser,
-            box=scene.box,
-            occupancy_resolution=march.occupancy_resolution,
-        )
+        partial(init_train_state, field=field, sampler=sampler, optimiser=optimiser)
     )
 
     options = config.uncertainty
-    grid = DeformationGrid(jnp.asarray(scene.box), options.log2_cells)
+    grid = DeformationGrid(jnp.asarray(scene.box), options.log2_cells, contracted=scene.unbounded)
     prior_weight = options.prior_weight or default_prior_weight(options.log2_cells)
     curvature_fn = make_curvature_fn(
-        field, grid, march_options, background=scene.background, weighting=options.weighting
+        field, sampler, grid, background=background, weighting=options.weighting
     )
     render_chunk = make_render_chunk_fn(
         field,
+        sampler,
         grid,
-        march_options,
-        background=jnp.asarray(scene.background),
+        background=background,
         capacity=8 * RENDER_CHUNK,
         variant=options.variant,
         scale=options.scale,
@@ -177,12 +165,12 @@ def build_problem(config, scene: Scene) -> Problem:
 
     def curvature(state: TrainState, table, view_ids, within, progress_fn=None):
         return curvature_fn(
-            state.params, state.occupancy, table, view_ids, within, progress_fn=progress_fn
+            state.params, state.sampler_state, table, view_ids, within, progress_fn=progress_fn
         )
 
     def render(state: TrainState, jac_sq_sum=None, num_rays: int = 0):
         if jac_sq_sum is None:
-            return partial(render_chunk, state.params, state.occupancy, None)
+            return partial(render_chunk, state.params, state.sampler_state, None)
         variance = vertex_variance(
             jac_sq_sum,
             num_rays=num_rays,
@@ -190,23 +178,23 @@ def build_problem(config, scene: Scene) -> Problem:
             weighting=options.weighting,
             variant=options.variant,
         )
-        return partial(render_chunk, state.params, state.occupancy, variance)
+        return partial(render_chunk, state.params, state.sampler_state, variance)
 
     @jax.jit
     def density(state: TrainState, positions):
+        density = field.density(state.params["field"], positions)
+        if scene.unbounded:
+            return density
         # Outside of its box a field reads the nearest face, but the renderer never looks there.
         lower, upper = jnp.asarray(scene.box)
-        in_box = ((positions >= lower) & (positions <= upper)).all(-1)
-        return jnp.where(in_box, field.density(state.params, positions), 0.0)
+        return jnp.where(((positions >= lower) & (positions <= upper)).all(-1), density, 0.0)
 
     def restart(key, state: TrainState) -> TrainState:
         fresh = init_train(key)
         if config.from_scratch:
             return fresh
-        return fresh.replace(params=state.params, occupancy=state.occupancy)
+        return fresh.replace(params=state.params, sampler_state=state.sampler_state)
 
-    table = make_pixel_table(scene)
-    source, table = _make_source(config, scene, table)
     calls_per_round = -(-train.num_steps // train.steps_per_call)
     lpips_fn, lpips_reason = (None, "switched off: config.lpips_net is empty")
     if config.lpips_net:

@@ -18,6 +18,7 @@ from bavs_jax.active import ActiveState, Choice, init_active_state
 from bavs_jax.training.checkpoints import Checkpoints
 from bavs_jax.uncertainty.streaming import training_pixels
 from experiments import acquisitions
+from experiments.baselines import measure_baselines
 from experiments.build import Problem, initial_views, run_key
 from experiments.evaluate import evaluate_views, picture_arrays, spread_evenly
 from experiments.files import append_line, write_arrays, write_json
@@ -225,8 +226,16 @@ class Run:
             "device": _device_name(),
             "completed": completed,
             "lpips_reason": self.problem.lpips_reason,
+            "baselines": self._baselines() if completed else None,
             "rounds": self.rounds,
         }
+
+    def _baselines(self) -> dict[str, float]:
+        """Of the last round's test views; pictures taken on the way are left out."""
+        scene = self.problem.scene
+        used = np.concatenate([row["selected"] for row in self.rounds]).astype(int)
+        test_views = spread_evenly(scene.test, self.config.num_test_final)
+        return measure_baselines(scene, used[used < scene.num_views], test_views)
 
     def _log(self, **values) -> None:
         head = {"time": time.time(), "policy": self.policy or "initial", "seed": self.seed}

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.fields.deformation import displace
-from bavs_jax.rendering.compositing import composite, render_weights
+from bavs_jax.rendering.compositing import composite_colour, render_weights
 
 
 def trilinear_loop(box, cells, point):
@@ -29,7 +29,7 @@ def colours_with_offsets(field_fn, grid, rays, samples, background, theta):
     positions = rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]
     directions = jnp.broadcast_to(rays.directions[:, None], positions.shape)
     density, rgb = field_fn(positions + displace(grid, theta, positions), directions)
-    return composite(render_weights(density, samples.deltas), rgb, background)
+    return composite_colour(render_weights(density, samples.deltas), rgb, background)
 
 
 def dense_jacobian(field_fn, grid, rays, samples, background):

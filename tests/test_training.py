@@ -9,7 +9,8 @@ import pytest
 
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.fields.hash_grid import make_hash_grid_field
-from bavs_jax.rendering.sampling import make_march_options, march
+from bavs_jax.rendering.samplers import make_occupancy_sampler
+from bavs_jax.rendering.sampling import make_march_options
 from bavs_jax.training.batches import (
     make_pixel_table,
     pixel_colours,
@@ -34,12 +35,13 @@ def trainer():
     options = make_march_options(
         scene.box, near=scene.near, far=scene.far, num_steps=32, num_slots=24
     )
+    sampler = make_occupancy_sampler(scene.box, options, resolution=16)
     optimiser, schedule = make_optimiser(learning_rate=1e-2, final_share=0.3, num_steps=64)
     train = make_train_fn(
         field,
+        sampler,
         optimiser,
         schedule,
-        options,
         background=scene.background,
         num_rays=64,
         capacity=1024,
@@ -47,11 +49,9 @@ def trainer():
     )
 
     def fresh(seed=0):
-        return init_train_state(
-            jax.random.key(seed), field, optimiser, box=scene.box, occupancy_resolution=16
-        )
+        return init_train_state(jax.random.key(seed), field, sampler, optimiser)
 
-    return scene, field, options, train, fresh
+    return scene, field, sampler, train, fresh
 
 
 def test_sampled_pixels_come_from_training_views_alone_and_from_all_of_them(trainer):
@@ -59,11 +59,13 @@ def test_sampled_pixels_come_from_training_views_alone_and_from_all_of_them(trai
     table = make_pixel_table(scene)
     mask = np.zeros(scene.num_views, bool)
     mask[[1, 4, 7]] = True
-    rays, rgb, weight = sample_pixels(jax.random.key(0), table, jnp.asarray(mask), 3000)
+    batch = sample_pixels(jax.random.key(0), table, jnp.asarray(mask), 3000)
+    rays, rgb = batch.rays, batch.rgb
     positions = np.asarray(scene.cameras.positions)
     owner = np.linalg.norm(rays.origins[:, None] - positions, axis=-1).argmin(1)
     counts = np.bincount(owner, minlength=scene.num_views)
-    assert set(np.flatnonzero(counts)) == {1, 4, 7} and (weight == 1).all()
+    assert set(np.flatnonzero(counts)) == {1, 4, 7} and (batch.ray_weight == 1).all()
+    np.testing.assert_array_equal(owner, batch.view_ids)
     # Binomial with p = 1/3: standard deviation 26; four of them.
     np.testing.assert_allclose(counts[[1, 4, 7]], 1000, atol=104)
     assert rgb.min() >= 0 and rgb.max() <= 1
@@ -88,8 +90,8 @@ def test_masked_pixels_have_no_weight():
     scene = toy_scene(num_views=4, num_test=1)
     keep = np.arange(len(scene.pixels)) % 2 == 0
     table = make_pixel_table(scene).replace(pixel_mask=jnp.asarray(keep))
-    _, _, weight = sample_pixels(jax.random.key(0), table, jnp.ones(4, bool), 400)
-    assert 120 < int(weight.sum()) < 280  # half of 400, many standard deviations wide
+    batch = sample_pixels(jax.random.key(0), table, jnp.ones(4, bool), 400)
+    assert 120 < int(batch.ray_weight.sum()) < 280  # half of 400, many standard deviations wide
     view_ids, within = training_pixels(table, np.ones(4, bool))
     assert len(view_ids) == keep.sum()
     assert (keep[scene.offsets[view_ids] + within]).all()
@@ -129,10 +131,11 @@ def test_training_is_deterministic(trainer):
 
 
 def test_streamed_curvature_equals_one_dense_call_for_any_bucket(trainer):
-    scene, field, options, _, fresh = trainer
+    scene, field, sampler, _, fresh = trainer
     table, state = make_pixel_table(scene), fresh()
-    occupied = jax.random.uniform(jax.random.key(1), state.occupancy.occupied.shape) < 0.3
-    occupancy = state.occupancy.replace(occupied=occupied)
+    occupancy = state.sampler_state
+    occupied = jax.random.uniform(jax.random.key(1), occupancy.occupied.shape) < 0.3
+    occupancy = occupancy.replace(occupied=occupied)
     params = jax.tree.map(
         lambda x: x + 0.3 * jax.random.normal(jax.random.key(2), x.shape), state.params
     )
@@ -144,15 +147,15 @@ def test_streamed_curvature_equals_one_dense_call_for_any_bucket(trainer):
     @jax.jit
     def dense():
         zero = jnp.zeros((grid.num_vertices, 3))
-        samples = march(rays, occupancy, options)
-        field_fn = partial(field.apply, params)
+        samples = sampler.sample(None, {}, occupancy, rays)[0]
+        field_fn = partial(field.apply, params["field"])
         return add_jac_sq_sum(zero, field_fn, grid, rays, samples, background=background)
 
     want = dense()
     assert float(want.max()) > 0
     for buckets, chunk in (((8, 16), 256), ((4,), 999)):
         curvature = make_curvature_fn(
-            field, grid, options, background=background, buckets=buckets, chunk_samples=chunk
+            field, sampler, grid, background=background, buckets=buckets, chunk_samples=chunk
         )
         done = []
         got = curvature(params, occupancy, table, view_ids, within, progress_fn=done.append)

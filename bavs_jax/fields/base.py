@@ -8,13 +8,22 @@ from typing import Any, NamedTuple
 Params = Any
 
 
+def no_inputs(rays, samples, view_ids=None) -> dict:
+    """The `inputs` of a field that reads positions and directions alone."""
+    del rays, samples, view_ids
+    return {}
+
+
 class Field(NamedTuple):
     """A radiance field as pure functions; nothing in it holds state.
 
     `init(key) -> params`
-    `apply(params, positions [K, 3], directions [K, 3]) -> (density [K], rgb [K, 3])`
-    `density(params, positions [K, 3]) -> density [K]`
+    `apply(params, positions [K, 3], directions [K, 3], **inputs) -> (density [K], rgb [K, 3])`
+    `density(params, positions [K, 3], **inputs) -> density [K]`
     `penalty(params) -> []`, what training adds to the loss, times a weight
+    `inputs(rays, samples [R, S], view_ids [R] or None) -> {name: [R, S, ...]}`, what more the
+      field reads at each sample: the size of a pixel's cone there, or the view it belongs to.
+      `view_ids` are given only where the views are trained on.
 
     Positions are in scene units, directions are unit vectors, density is in 1 / scene unit and
     colour is sRGB in [0, 1].
@@ -24,3 +33,13 @@ class Field(NamedTuple):
     apply: Callable[..., tuple]
     density: Callable[..., Any]
     penalty: Callable[[Params], Any] = lambda params: 0.0
+    inputs: Callable[..., dict] = no_inputs
+
+
+class DensityField(NamedTuple):
+    """A field of density alone, such as a proposal; the functions are those of `Field`."""
+
+    init: Callable[..., Params]
+    density: Callable[..., Any]
+    penalty: Callable[[Params], Any] = lambda params: 0.0
+    inputs: Callable[..., dict] = no_inputs

@@ -1,7 +1,8 @@
 """The deformation field `D_theta`: offsets on the vertices of a grid, trilinear in between.
 
-The grid is addressed in coordinates normalised to the scene box; its offsets are added to
-positions in world space. `theta = 0` is the mode of the posterior.
+The grid is addressed in coordinates normalised to the scene box, or in contracted coordinates for
+unbounded scenes; its offsets are added to positions in world space. `theta = 0` is the mode of the
+posterior.
 """
 
 from __future__ import annotations
@@ -11,16 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from bavs_jax.fields.contraction import unit_coordinates
+
 # The eight corners of a cell, [8, 3], z fastest.
 CORNERS = np.indices((2, 2, 2), np.int32).reshape(3, 8).T
 
 
 @struct.dataclass
 class DeformationGrid:
-    """`(2^L + 1)^3` vertices over the scene box."""
+    """`(2^L + 1)^3` vertices over the scene box, or over contracted space around it."""
 
     box: jax.Array  # [2, 3] scene units
     log2_cells: int = struct.field(pytree_node=False)  # L
+    contracted: bool = struct.field(pytree_node=False, default=False)  # see `contraction.py`
 
     @property
     def cells(self) -> int:
@@ -34,10 +38,8 @@ class DeformationGrid:
 
 
 def grid_coordinates(grid: DeformationGrid, positions: jax.Array) -> jax.Array:
-    """Positions [..., 3] in cells, `[0, 2^L]`; points outside of the box get the nearest face."""
-    lower, upper = grid.box
-    unit = jnp.clip((positions - lower) / (upper - lower), 0.0, 1.0)
-    return unit * grid.cells
+    """Positions [..., 3] in scene units, as cells `[0, 2^L]` (see `unit_coordinates`)."""
+    return unit_coordinates(grid.box, positions, contracted=grid.contracted) * grid.cells
 
 
 def vertex_number(grid: DeformationGrid, vertex: jax.Array) -> jax.Array:

@@ -1,11 +1,13 @@
-"""A small, quick radiance field: a hash grid and two thin networks (Eq 1)."""
+"""A small, quick radiance field: a hash grid and two thin networks (Eq 1), and its proposals."""
 
 from __future__ import annotations
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 
-from bavs_jax.fields.base import Field
+from bavs_jax.fields.base import DensityField, Field, no_inputs
+from bavs_jax.fields.contraction import unit_coordinates
 from bavs_jax.fields.encodings import HashEncoding, level_resolutions, spherical_harmonics
 from bavs_jax.numerics import density_from_raw
 
@@ -18,6 +20,8 @@ class HashGridField(nn.Module):
       width: units of each hidden layer.
       geometry_features: what the density network hands to the colour network.
       direction_degree: spherical-harmonics bands of the view direction.
+      num_views: rows of the table of appearance codes.
+      appearance_features: of each view's code; 0 for none.
     """
 
     resolutions: tuple[int, ...]
@@ -26,6 +30,8 @@ class HashGridField(nn.Module):
     width: int
     geometry_features: int
     direction_degree: int
+    num_views: int = 0
+    appearance_features: int = 0
 
     def setup(self):
         self.encoding = HashEncoding(self.resolutions, self.features, self.log2_table_size)
@@ -33,16 +39,30 @@ class HashGridField(nn.Module):
         self.density_out = nn.Dense(1 + self.geometry_features)
         self.colour_hidden = [nn.Dense(self.width) for _ in range(2)]
         self.colour_out = nn.Dense(3)
+        if self.appearance_features:
+            # 0 to begin with, and for good where a view is never trained on.
+            shape = (self.num_views, self.appearance_features)
+            self.appearance = self.param("appearance", nn.initializers.zeros, shape)
 
     def geometry(self, unit_positions):
         hidden = nn.relu(self.density_hidden(self.encoding(unit_positions)))
         out = self.density_out(hidden)
         return density_from_raw(out[:, 0]), out[:, 1:]
 
-    def __call__(self, unit_positions, directions):
+    def codes(self, num: int, view_ids):
+        """Appearance codes of `num` points: of their views, or the mean of all trained ones."""
+        if view_ids is not None:
+            return self.appearance[view_ids]
+        num_trained = jnp.maximum((self.appearance != 0).any(-1).sum(), 1)
+        mean = self.appearance.sum(0) / num_trained
+        return jnp.broadcast_to(mean, (num, self.appearance_features))
+
+    def __call__(self, unit_positions, directions, view_ids=None):
         density, features = self.geometry(unit_positions)
-        harmonics = spherical_harmonics(directions, self.direction_degree)
-        hidden = jnp.concatenate([features, harmonics], axis=-1)
+        parts = [features, spherical_harmonics(directions, self.direction_degree)]
+        if self.appearance_features:
+            parts.append(self.codes(len(directions), view_ids))
+        hidden = jnp.concatenate(parts, axis=-1)
         for layer in self.colour_hidden:
             hidden = nn.relu(layer(hidden))
         return density, nn.sigmoid(self.colour_out(hidden))
@@ -59,17 +79,24 @@ def make_hash_grid_field(
     width: int = 64,
     geometry_features: int = 15,
     direction_degree: int = 4,
+    contracted: bool = False,
+    num_views: int = 0,
+    appearance_features: int = 0,
 ) -> Field:
-    """Makes a hash-grid field over a box.
+    """Makes a hash-grid field over a box, or over contracted space around it.
 
     Args:
-      box: [2, 3] lower and upper corner, scene units. Points outside read the nearest face.
+      box: [2, 3] lower and upper corner, scene units.
       num_levels, coarsest, finest: levels of the grid and their cells per side.
       features: features per vertex.
       log2_table_size: largest table of a level is `2^log2_table_size` rows.
       width: units of each hidden layer.
       geometry_features: features handed from the density to the colour network.
       direction_degree: spherical-harmonics bands, 1 (no view dependence) to 4.
+      contracted: see `unit_coordinates`.
+      num_views: views of the scene; needed with appearance codes.
+      appearance_features: of the code that each view trained on has for its exposure and white
+        balance; 0 for none. Views that are not trained on are read with the mean code.
 
     Returns:
       A `Field`.
@@ -82,25 +109,85 @@ def make_hash_grid_field(
         width=width,
         geometry_features=geometry_features,
         direction_degree=direction_degree,
+        num_views=num_views,
+        appearance_features=appearance_features,
     )
 
     def to_unit(positions):
-        return jnp.clip((positions - box[0]) / (box[1] - box[0]), 0.0, 1.0)
+        return unit_coordinates(box, positions, contracted=contracted)
 
     def init(key):
         point = jnp.full((1, 3), 0.5)
         return module.init(key, point, jnp.array([[0.0, 0.0, 1.0]]))["params"]
 
-    def apply(params, positions, directions):
-        return module.apply({"params": params}, to_unit(positions), directions)
+    def apply(params, positions, directions, view_ids=None):
+        return module.apply({"params": params}, to_unit(positions), directions, view_ids)
 
-    def density(params, positions):
+    def density(params, positions, view_ids=None):
+        del view_ids
         unit = to_unit(positions)
         return module.apply({"params": params}, unit, method=HashGridField.geometry)[0]
 
-    def penalty(params):
-        # Mean per level, so that the few entries of a coarse level weigh as much as the many of a
-        # fine one (Barron et al. 2023, section 5): entries that few rays see stay smooth.
-        return sum(jnp.square(table).mean() for table in params["encoding"].values())
+    def inputs(rays, samples, view_ids=None):
+        del rays
+        if view_ids is None:
+            return {}
+        return {"view_ids": jnp.broadcast_to(view_ids[:, None], samples.t_mids.shape)}
 
-    return Field(init=init, apply=apply, density=density, penalty=penalty)
+    def penalty(params):
+        return table_penalty(params["encoding"])
+
+    return Field(init, apply, density, penalty, inputs if appearance_features else no_inputs)
+
+
+def table_penalty(tables: dict) -> jax.Array:
+    """Mean square of each level's entries, summed: entries that few rays see stay smooth.
+
+    A mean per level, so that the few entries of a coarse level weigh as much as the many of a
+    fine one (Barron et al. 2023, section 5).
+    """
+    return sum(jnp.square(table).mean() for table in tables.values())
+
+
+class HashGridDensity(nn.Module):
+    """Density alone, from a hash grid and one thin layer; attributes as in `HashGridField`."""
+
+    resolutions: tuple[int, ...]
+    features: int
+    log2_table_size: int
+    width: int
+
+    @nn.compact
+    def __call__(self, unit_positions):
+        encoding = HashEncoding(
+            self.resolutions, self.features, self.log2_table_size, name="encoding"
+        )
+        hidden = nn.relu(nn.Dense(self.width)(encoding(unit_positions)))
+        return density_from_raw(nn.Dense(1)(hidden)[:, 0])
+
+
+def make_hash_grid_density(
+    box,
+    *,
+    num_levels: int = 4,
+    coarsest: int = 16,
+    finest: int = 128,
+    features: int = 2,
+    log2_table_size: int = 14,
+    width: int = 16,
+    contracted: bool = False,
+) -> DensityField:
+    """Makes a proposal; the arguments are those of `make_hash_grid_field`."""
+    box = jnp.asarray(box, jnp.float32)
+    resolutions = level_resolutions(num_levels, coarsest, finest)
+    module = HashGridDensity(resolutions, features, log2_table_size, width)
+
+    def density(params, positions):
+        unit = unit_coordinates(box, positions, contracted=contracted)
+        return module.apply({"params": params}, unit)
+
+    return DensityField(
+        init=lambda key: module.init(key, jnp.full((1, 3), 0.5))["params"],
+        density=density,
+        penalty=lambda params: table_penalty(params["encoding"]),
+    )

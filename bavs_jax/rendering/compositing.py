@@ -53,6 +53,19 @@ def composite(weights: jax.Array, values: jax.Array, background) -> jax.Array:
     return (weights[..., None] * values).sum(-2) + (1.0 - opacity)[..., None] * background
 
 
+def composite_colour(weights: jax.Array, rgb: jax.Array, background) -> jax.Array:
+    """Colours of rays (Eq 2), [..., 3].
+
+    Args:
+      weights: [..., S].
+      rgb: [..., S, 3].
+      background: [3] or [..., 3] colour behind everything. None lets the last sample of a ray
+        stand for all that lies behind it, as in nerfacto: for unbounded scenes, where a ray
+        always ends somewhere. Needs samples that fill their slots.
+    """
+    return composite(weights, rgb, rgb[..., -1, :] if background is None else background)
+
+
 def expected_depth(weights: jax.Array, t_mids: jax.Array) -> jax.Array:
     """Mean distance of what is seen, `sum_i w_i t_i / sum_i w_i`, scene units; 0 on empty rays."""
     return safe_divide((weights * t_mids).sum(-1), weights.sum(-1))

@@ -1,7 +1,8 @@
-"""Evaluates a function at the valid samples only, in a buffer of fixed size.
+"""Evaluates a function at samples: at the valid ones only in a buffer of fixed size, or at all.
 
 Most slots of [R, S] are empty. Valid samples are numbered row by row and evaluated in a packed
-buffer of K places; the outputs are read back into [R, S], where all compositing happens.
+buffer of K places; the outputs are read back into [R, S], where all compositing happens. Where
+every slot is valid there is nothing to pack, and `evaluate_dense` goes through them in order.
 """
 
 from __future__ import annotations
@@ -77,3 +78,28 @@ def evaluate_all_passes(fn: Callable, sample_mask: jax.Array, *, capacity: int):
     shapes = jax.eval_shape(one_pass, jnp.int32(0))
     empty = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
     return jax.lax.while_loop(lambda carry: carry[0] < total, body, (jnp.int32(0), empty))[1]
+
+
+def evaluate_dense(fn: Callable, num_rays: int, num_slots: int, *, capacity: int | None):
+    """All slots in order; differentiable.
+
+    Args:
+      fn: see `evaluate_one_pass`; all slots count as valid.
+      num_rays, num_slots: R and S.
+      capacity: most slots at once, in groups of whole rays; None takes all at once.
+
+    Returns:
+      outputs as [R, S, ...].
+    """
+    group = num_rays if capacity is None else max(min(capacity // num_slots, num_rays), 1)
+    slot = jnp.tile(jnp.arange(num_slots), group)
+
+    def evaluate_rays(first):
+        row = jnp.minimum(first + jnp.repeat(jnp.arange(group), num_slots), num_rays - 1)
+        outputs = fn(row, slot, jnp.ones_like(slot, bool))
+        return jax.tree.map(lambda x: x.reshape(group, num_slots, *x.shape[1:]), outputs)
+
+    if group == num_rays:
+        return evaluate_rays(0)
+    parts = jax.lax.map(evaluate_rays, jnp.arange(0, num_rays, group))
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:num_rays], parts)

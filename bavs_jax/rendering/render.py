@@ -10,9 +10,14 @@ import jax.numpy as jnp
 from flax import struct
 
 from bavs_jax.cameras import Rays
-from bavs_jax.rendering.compositing import composite, expected_depth, render_weights
-from bavs_jax.rendering.packing import evaluate_all_passes, evaluate_one_pass
-from bavs_jax.rendering.sampling import Samples
+from bavs_jax.rendering.compositing import (
+    composite,
+    composite_colour,
+    expected_depth,
+    render_weights,
+)
+from bavs_jax.rendering.packing import evaluate_all_passes, evaluate_dense, evaluate_one_pass
+from bavs_jax.rendering.sampling import Samples, flatten_inputs
 
 
 @struct.dataclass
@@ -42,6 +47,7 @@ def render_rays(
     background,
     capacity: int,
     exact: bool,
+    inputs: Mapping[str, jax.Array] | None = None,
     displace_fn: Callable | None = None,
     channels: Mapping[str, Channel] | None = None,
 ) -> Rendering:
@@ -50,11 +56,14 @@ def render_rays(
     Args:
       rays: R rays.
       samples: [R, S] where to look.
-      field_fn: (positions [K, 3], directions [K, 3]) -> (density [K], rgb [K, 3]).
-      background: [3] colour of what lies behind everything, or [R, 3].
+      field_fn: (positions [K, 3], directions [K, 3], **inputs) -> (density [K], rgb [K, 3]).
+      background: [3] colour of what lies behind everything, or [R, 3]; None: see
+        `composite_colour`.
       capacity: places of the buffer in which valid samples are evaluated.
       exact: true evaluates all samples in as many passes as needed, and cannot be differentiated
-        in reverse mode; false makes one pass and marks rays that did not fit in `ray_mask`.
+        in reverse mode; false makes one pass and marks rays that did not fit in `ray_mask`. Dense
+        samples always fit: one pass then takes them all at once.
+      inputs: what more the field reads at each sample, by name, [R, S, ...] (`Field.inputs`).
       displace_fn: positions [K, 3] -> offsets [K, 3] in scene units: the deformation `D(x)`; the
         field is read at `x + D(x)`.
       channels: more quantities to composite, by name; each reads the undisplaced position.
@@ -63,27 +72,33 @@ def render_rays(
       `Rendering` of R rays.
     """
     channels = dict(channels or {})
-    num_slots = samples.t_mids.shape[1]
+    num_rays, num_slots = samples.t_mids.shape
+    flat_inputs = flatten_inputs(inputs or {})
 
     def evaluate(row, slot, valid):
-        t = samples.t_mids.reshape(-1)[row * num_slots + slot]
+        place = row * num_slots + slot
+        t = samples.t_mids.reshape(-1)[place]
         directions = rays.directions[row]
         positions = rays.origins[row] + t[:, None] * directions
         moved = positions if displace_fn is None else positions + displace_fn(positions)
-        density, rgb = field_fn(moved, directions)
+        more = {name: x[place] for name, x in flat_inputs.items()}
+        density, rgb = field_fn(moved, directions, **more)
         extra = {name: channel.value_fn(positions) for name, channel in channels.items()}
         return jnp.where(valid, density, 0.0), rgb, extra
 
-    if exact:
+    ray_mask = jnp.ones(num_rays, bool)
+    if samples.dense:
+        at_once = capacity if exact else None
+        outputs = evaluate_dense(evaluate, num_rays, num_slots, capacity=at_once)
+    elif exact:
         outputs = evaluate_all_passes(evaluate, samples.sample_mask, capacity=capacity)
-        ray_mask = jnp.ones(samples.t_mids.shape[0], bool)
     else:
         outputs, ray_mask = evaluate_one_pass(evaluate, samples.sample_mask, capacity=capacity)
     density, rgb, extra = outputs
 
     weights = render_weights(density, samples.deltas)
     return Rendering(
-        rgb=composite(weights, rgb, background),
+        rgb=composite_colour(weights, rgb, background),
         depth=expected_depth(weights, samples.t_mids),
         opacity=weights.sum(-1),
         channels={

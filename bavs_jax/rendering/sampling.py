@@ -20,6 +20,22 @@ class Samples:
     deltas: jax.Array  # [R, S] length a sample stands for, scene units, 0 where invalid
     sample_mask: jax.Array  # [R, S] bool
     thinned: jax.Array  # [R] bool, true where a ray had more occupied steps than slots
+    # Whether every slot is valid, but for rays that have none: nothing is gained by packing then.
+    dense: bool = struct.field(pytree_node=False, default=False)
+
+
+def flatten_inputs(inputs: dict) -> dict:
+    """What a field reads at each sample, [R, S, ...], as [R * S, ...]."""
+    return {name: x.reshape(-1, *x.shape[2:]) for name, x in inputs.items()}
+
+
+def first_slots(samples: Samples, num_slots: int) -> Samples:
+    """The same samples with fewer slots, for rays that have no more valid ones than that."""
+    return samples.replace(
+        t_mids=samples.t_mids[:, :num_slots],
+        deltas=samples.deltas[:, :num_slots],
+        sample_mask=samples.sample_mask[:, :num_slots],
+    )
 
 
 @struct.dataclass

@@ -40,7 +40,19 @@ def make_pixel_table(scene: Scene) -> PixelTable:
     )
 
 
-def sample_pixels(key: jax.Array, table: PixelTable, is_training_view: jax.Array, num_rays: int):
+@struct.dataclass
+class PixelBatch:
+    """R training pixels."""
+
+    rays: Rays
+    rgb: jax.Array  # [R, 3] true colours in [0, 1]
+    ray_weight: jax.Array  # [R], 0 for masked pixels
+    view_ids: jax.Array  # [R] int32
+
+
+def sample_pixels(
+    key: jax.Array, table: PixelTable, is_training_view: jax.Array, num_rays: int
+) -> PixelBatch:
     """Uniform over all pixels of the training views, with replacement.
 
     Args:
@@ -50,7 +62,7 @@ def sample_pixels(key: jax.Array, table: PixelTable, is_training_view: jax.Array
       num_rays: R.
 
     Returns:
-      `Rays` [R], their true colours [R, 3] in [0, 1], and weights [R], 0 for masked pixels.
+      A batch of R pixels.
     """
     sizes = jnp.where(is_training_view, jnp.diff(table.offsets), 0)
     ends = jnp.cumsum(sizes)
@@ -62,7 +74,7 @@ def sample_pixels(key: jax.Array, table: PixelTable, is_training_view: jax.Array
         weight = jnp.ones(num_rays)
     else:
         weight = table.pixel_mask[table.offsets[view_ids] + within].astype(jnp.float32)
-    return rays, pixel_colours(table, view_ids, within), weight
+    return PixelBatch(rays, pixel_colours(table, view_ids, within), weight, view_ids)
 
 
 def pixel_colours(table: PixelTable, view_ids: jax.Array, within: jax.Array) -> jax.Array:

@@ -12,9 +12,8 @@ import optax
 from flax import struct
 
 from bavs_jax.fields.base import Field
-from bavs_jax.rendering.occupancy import Occupancy, init_occupancy, update_occupancy
 from bavs_jax.rendering.render import render_rays
-from bavs_jax.rendering.sampling import MarchOptions, march
+from bavs_jax.rendering.samplers import Sampler
 from bavs_jax.training.batches import sample_pixels
 from bavs_jax.training.losses import colour_loss
 
@@ -24,9 +23,9 @@ class TrainState:
     """What must be carried from one optimiser step to the next."""
 
     step: jax.Array  # [] int32, optimiser steps since the parameters were drawn
-    params: Any
+    params: dict[str, Any]  # "field" and "sampler", both trained
     opt_state: optax.OptState
-    occupancy: Occupancy
+    sampler_state: Any  # what the sampler carries untrained, such as an occupancy grid
 
 
 @struct.dataclass
@@ -53,63 +52,75 @@ def make_optimiser(*, learning_rate: float, final_share: float, num_steps: int, 
     return optax.adam(schedule, b1=0.9, b2=0.99, eps=1e-15), schedule
 
 
-def init_train_state(key, field: Field, optimiser, *, box, occupancy_resolution: int) -> TrainState:
-    """Fresh parameters, a fresh optimiser and an occupancy grid that knows nothing."""
-    params = field.init(key)
+def init_train_state(key, field: Field, sampler: Sampler, optimiser) -> TrainState:
+    """Fresh parameters, a fresh optimiser and a sampler that knows nothing."""
+    params = {"field": field.init(key), "sampler": sampler.init(jax.random.fold_in(key, 1))}
     return TrainState(
         step=jnp.int32(0),
         params=params,
         opt_state=optimiser.init(params),
-        occupancy=init_occupancy(box, resolution=occupancy_resolution),
+        sampler_state=sampler.init_state(),
     )
 
 
 def make_train_fn(
     field: Field,
+    sampler: Sampler,
     optimiser,
     schedule: Callable,
-    march_options: MarchOptions,
     *,
     background,
     num_rays: int,
     capacity: int,
     penalty_weight: float = 0.0,
     steps_per_call: int = 16,
-    occupancy_samples: int | None = None,
 ) -> Callable:
     """Makes the compiled training function.
+
+    Args:
+      field: the radiance field.
+      sampler: how rays are sampled; its parameters are trained along.
+      optimiser, schedule: from `make_optimiser`.
+      background: [3] colour behind everything, or None (see `composite_colour`).
+      num_rays: R, rays of one step.
+      capacity: places of the buffer for valid samples; a dense sampler needs none.
+      penalty_weight: of the field's own penalty.
+      steps_per_call: optimiser steps compiled together.
 
     Returns:
       `train(key, state, table, is_training_view) -> (state, TrainInfo)`: `steps_per_call` steps in
       one jitted call. Views are a mask, so adding views compiles nothing anew. `state` is donated.
     """
-    background = jnp.asarray(background, jnp.float32)
+    background = None if background is None else jnp.asarray(background, jnp.float32)
 
-    def loss_fn(params, key, occupancy, table, is_training_view):
-        pixel_key, jitter_key = jax.random.split(key)
-        rays, target, ray_weight = sample_pixels(pixel_key, table, is_training_view, num_rays)
-        jitter = jax.random.uniform(jitter_key, (num_rays,))
-        samples = march(rays, occupancy, march_options, jitter=jitter)
+    def loss_fn(params, key, sampler_state, table, is_training_view):
+        pixel_key, sample_key = jax.random.split(key)
+        batch = sample_pixels(pixel_key, table, is_training_view, num_rays)
+        samples, aux = sampler.sample(sample_key, params["sampler"], sampler_state, batch.rays)
         rendering = render_rays(
-            rays,
+            batch.rays,
             samples,
-            partial(field.apply, params),
+            partial(field.apply, params["field"]),
             background=background,
             capacity=capacity,
             exact=False,
+            inputs=field.inputs(batch.rays, samples, batch.view_ids),
         )
-        ray_weight = ray_weight * rendering.ray_mask
-        loss = colour_loss(rendering.rgb, target, ray_weight)
+        ray_weight = batch.ray_weight * rendering.ray_mask
+        colour_loss_fn = partial(colour_loss, target=batch.rgb, ray_weight=ray_weight)
+        loss = colour_loss_fn(rendering.rgb)
+        sampler_loss = sampler.loss(aux, samples, rendering.weights, colour_loss_fn)
         report = {
             "rays": rendering.ray_mask.sum(),
             "samples": (samples.sample_mask & rendering.ray_mask[:, None]).sum(),
             "thinned": samples.thinned.mean(),
         }
-        return loss + penalty_weight * field.penalty(params), {"loss": loss, **report}
+        total = loss + sampler_loss + penalty_weight * field.penalty(params["field"])
+        return total, {"loss": loss, **report}
 
     def one_step(state, key, table, is_training_view):
         (_, report), grads = jax.value_and_grad(loss_fn, has_aux=True)(
-            state.params, key, state.occupancy, table, is_training_view
+            state.params, key, state.sampler_state, table, is_training_view
         )
         updates, opt_state = optimiser.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
@@ -118,16 +129,11 @@ def make_train_fn(
 
     @partial(jax.jit, donate_argnums=1)
     def train(key, state, table, is_training_view):
-        occupancy_key, steps_key = jax.random.split(key)
-        cells = state.occupancy.density.shape[0]
-        occupancy = update_occupancy(
-            occupancy_key,
-            state.occupancy,
-            partial(field.density, state.params),
-            num_samples=occupancy_samples or cells // 4,
-            step_size=march_options.step_size,
+        update_key, steps_key = jax.random.split(key)
+        density_fn = partial(field.density, state.params["field"])
+        state = state.replace(
+            sampler_state=sampler.update(update_key, state.sampler_state, density_fn, state.step)
         )
-        state = state.replace(occupancy=occupancy)
         rate = schedule(state.step)
         state, reports = jax.lax.scan(
             lambda s, k: one_step(s, k, table, is_training_view),

@@ -22,14 +22,14 @@ from bavs_jax.fields.deformation import (
     trilinear_weights,
     vertex_number,
 )
-from bavs_jax.rendering.compositing import composite, render_weights
-from bavs_jax.rendering.sampling import Samples
+from bavs_jax.rendering.compositing import composite_colour, render_weights
+from bavs_jax.rendering.sampling import Samples, flatten_inputs
 
 WEIGHTINGS = ("eq13", "eq11", "empirical")
 
 
 def colour_jacobian(
-    field_fn: Callable, rays: Rays, samples: Samples, *, background
+    field_fn: Callable, rays: Rays, samples: Samples, *, background, inputs: dict | None = None
 ) -> tuple[jax.Array, jax.Array]:
     """Derivative of each ray's colour by an offset of each of its samples.
 
@@ -38,30 +38,31 @@ def colour_jacobian(
     under `D_theta`. This is the definition; `split_colour_jacobian` is quicker and equal.
 
     Args:
-      field_fn: (positions [S, 3], directions [S, 3]) -> (density [S], rgb [S, 3]).
+      field_fn: (positions [S, 3], directions [S, 3], **inputs) -> (density [S], rgb [S, 3]).
       rays: R rays.
       samples: [R, S].
-      background: [3] colour behind everything.
+      background: [3] colour behind everything, or None (see `composite_colour`).
+      inputs: what more the field reads at each sample, by name, [R, S, ...].
 
     Returns:
       jacobian [R, 3, S, 3] (channel, sample, axis), 1 / scene unit, and the colours [R, 3].
     """
 
-    def ray_colour(offsets, origin, direction, t_mids, deltas):
+    def ray_colour(offsets, origin, direction, t_mids, deltas, more):
         positions = origin + t_mids[:, None] * direction + offsets
-        density, rgb = field_fn(positions, jnp.broadcast_to(direction, positions.shape))
-        colour = composite(render_weights(density, deltas), rgb, background)
+        density, rgb = field_fn(positions, jnp.broadcast_to(direction, positions.shape), **more)
+        colour = composite_colour(render_weights(density, deltas), rgb, background)
         return colour, colour
 
     zero = jnp.zeros((*samples.t_mids.shape, 3), samples.t_mids.dtype)
     # Invalid slots have deltas of 0, so their weight and derivative vanish.
     return jax.vmap(jax.jacrev(ray_colour, has_aux=True))(
-        zero, rays.origins, rays.directions, samples.t_mids, samples.deltas
+        zero, rays.origins, rays.directions, samples.t_mids, samples.deltas, inputs or {}
     )
 
 
 def split_colour_jacobian(
-    field_fn: Callable, rays: Rays, samples: Samples, *, background
+    field_fn: Callable, rays: Rays, samples: Samples, *, background, inputs: dict | None = None
 ) -> tuple[jax.Array, jax.Array]:
     """As `colour_jacobian`, by the chain rule at the samples' densities and colours.
 
@@ -73,9 +74,10 @@ def split_colour_jacobian(
     positions = rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]
     directions = jnp.broadcast_to(rays.directions[:, None], positions.shape)
     flat_directions = directions.reshape(-1, 3)
+    flat_inputs = flatten_inputs(inputs or {})
 
     def field_at(flat_positions):
-        return field_fn(flat_positions, flat_directions)
+        return field_fn(flat_positions, flat_directions, **flat_inputs)
 
     def along(axis):
         tangent = jnp.broadcast_to(axis, flat_directions.shape)
@@ -88,7 +90,7 @@ def split_colour_jacobian(
     rgb_slope = jnp.stack([c for _, c in slopes], -1).reshape(*shape, 3, 3)  # [R, S, c, axis]
 
     def ray_colour(density, rgb, deltas):
-        colour = composite(render_weights(density, deltas), rgb, background)
+        colour = composite_colour(render_weights(density, deltas), rgb, background)
         return colour, colour
 
     (by_density, by_rgb), colour = jax.vmap(jax.jacrev(ray_colour, argnums=(0, 1), has_aux=True))(
@@ -164,13 +166,14 @@ def add_jac_sq_sum(
     target: jax.Array | None = None,
     ray_weight: jax.Array | None = None,
     weighting: str = "eq13",
+    inputs: dict | None = None,
     jacobian_fn: Callable = split_colour_jacobian,
 ) -> jax.Array:
     """Adds R rays to the raw sum of squared Jacobians (Eqs 11-13).
 
     Args:
       jac_sq_sum: [G, 3] the sum so far.
-      field_fn, rays, samples, background: see `colour_jacobian`.
+      field_fn, rays, samples, background, inputs: see `colour_jacobian`.
       grid: the deformation grid of G vertices.
       target: [R, 3] true colours; needed by `eq11` and `empirical`.
       ray_weight: [R] factor of each ray's contribution, 0 for padding; 1 when None.
@@ -180,7 +183,7 @@ def add_jac_sq_sum(
     Returns:
       [G, 3] the new sum.
     """
-    jacobian, rgb = jacobian_fn(field_fn, rays, samples, background=background)
+    jacobian, rgb = jacobian_fn(field_fn, rays, samples, background=background, inputs=inputs)
     residual = None if target is None else rgb - target
     jacobian = weight_jacobian(jacobian, residual, weighting)
     positions = rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]

@@ -13,14 +13,14 @@ from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.rendering.images import render_views
 from bavs_jax.rendering.render import render_rays
-from bavs_jax.rendering.sampling import MarchOptions, march
+from bavs_jax.rendering.samplers import Sampler
 from bavs_jax.uncertainty.channel import finish_uncertainty, make_uncertainty_channel
 
 
 def make_render_chunk_fn(
     field: Field,
+    sampler: Sampler,
     grid: DeformationGrid,
-    march_options: MarchOptions,
     *,
     background,
     capacity: int,
@@ -30,13 +30,13 @@ def make_render_chunk_fn(
     """Makes the compiled rendering of a chunk of rays, uncertainty included (Fig 4).
 
     Returns:
-      `render_chunk(params, occupancy, variance [G], rays [R]) -> {"rgb" [R, 3], "depth" [R],
+      `render_chunk(params, sampler_state, variance [G], rays [R]) -> {"rgb" [R, 3], "depth" [R],
       "opacity" [R], "thinned" [R], "uncertainty" [R]}`; without the last where `variance` is None.
     """
 
     @jax.jit
-    def render_chunk(params, occupancy, variance, rays):
-        samples = march(rays, occupancy, march_options)
+    def render_chunk(params, sampler_state, variance, rays):
+        samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
         channels = {}
         if variance is not None:
             channels["uncertainty"] = make_uncertainty_channel(
@@ -45,10 +45,11 @@ def make_render_chunk_fn(
         rendering = render_rays(
             rays,
             samples,
-            partial(field.apply, params),
+            partial(field.apply, params["field"]),
             background=background,
             capacity=capacity,
             exact=True,
+            inputs=field.inputs(rays, samples),
             channels=channels,
         )
         return {

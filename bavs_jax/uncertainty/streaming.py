@@ -11,7 +11,8 @@ import numpy as np
 
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid
-from bavs_jax.rendering.sampling import MarchOptions, march
+from bavs_jax.rendering.samplers import Sampler
+from bavs_jax.rendering.sampling import first_slots
 from bavs_jax.training.batches import PixelTable, pixel_colours, view_pixel_rays
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 
@@ -31,8 +32,8 @@ def training_pixels(table: PixelTable, is_training_view) -> tuple[np.ndarray, np
 
 def make_curvature_fn(
     field: Field,
+    sampler: Sampler,
     grid: DeformationGrid,
-    march_options: MarchOptions,
     *,
     background,
     weighting: str = "eq13",
@@ -43,38 +44,41 @@ def make_curvature_fn(
 
     `vmap(jacrev)` needs a fixed number of samples a ray. Rays are sorted into buckets by how many
     occupied samples they have, so that short ones are not padded to the longest; rays that meet
-    nothing have no curvature and are not evaluated.
+    nothing have no curvature and are not evaluated. A dense sampler makes one bucket of all rays.
 
     Args:
       field: the radiance field.
+      sampler: how rays are sampled; its samples are held fixed.
       grid: the deformation grid.
-      march_options: how rays are sampled.
-      background: [3] colour behind everything.
+      background: [3] colour behind everything, or None (see `composite_colour`).
       weighting: one of `curvature.WEIGHTINGS`.
-      buckets: sample slots of each compiled shape; the march's `num_slots` is added if larger.
+      buckets: sample slots of each compiled shape; the sampler's `num_slots` is added if larger.
       chunk_samples: slots of one compiled call.
 
     Returns:
-      `curvature(params, occupancy, table, view_ids [N], within [N], progress_fn=None)` ->
+      `curvature(params, sampler_state, table, view_ids [N], within [N], progress_fn=None)` ->
       `jac_sq_sum` [G, 3]. `progress_fn(n)` is called with the number of rays done.
     """
-    slots = march_options.num_slots
+    slots = sampler.num_slots
+    buckets = () if sampler.dense else buckets
     buckets = tuple(sorted({b for b in buckets if b < slots} | {slots}))
-    background = jnp.asarray(background, jnp.float32)
+    background = None if background is None else jnp.asarray(background, jnp.float32)
     count_chunk = 8192
 
     @jax.jit
-    def count_samples(occupancy, table, view_ids, within):
+    def count_samples(params, sampler_state, table, view_ids, within):
         rays = view_pixel_rays(table.cameras, view_ids, within)
-        return march(rays, occupancy, march_options).sample_mask.sum(-1)
+        samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
+        return samples.sample_mask.sum(-1)
 
     @partial(jax.jit, static_argnames="bucket", donate_argnums=0)
-    def add_chunk(total, params, occupancy, table, view_ids, within, ray_weight, *, bucket):
+    def add_chunk(total, params, sampler_state, table, view_ids, within, ray_weight, *, bucket):
         rays = view_pixel_rays(table.cameras, view_ids, within)
-        samples = march(rays, occupancy, march_options.replace(num_slots=bucket))
+        samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
+        samples = first_slots(samples, bucket)
         return add_jac_sq_sum(
             total,
-            partial(field.apply, params),
+            partial(field.apply, params["field"]),
             grid,
             rays,
             samples,
@@ -82,16 +86,21 @@ def make_curvature_fn(
             target=None if weighting == "eq13" else pixel_colours(table, view_ids, within),
             ray_weight=ray_weight,
             weighting=weighting,
+            inputs=field.inputs(rays, samples, view_ids),
         )
 
-    def curvature(params, occupancy, table, view_ids, within, progress_fn=None):
-        total = jnp.zeros((grid.num_vertices, 3))
+    def all_counts(params, sampler_state, table, view_ids, within):
+        if sampler.dense:
+            return np.full(len(view_ids), slots)
         counts = []
         for rows, num in _chunks(np.arange(len(view_ids)), count_chunk):
-            counts.append(
-                np.asarray(count_samples(occupancy, table, view_ids[rows], within[rows]))[:num]
-            )
-        counts = np.concatenate(counts)
+            counted = count_samples(params, sampler_state, table, view_ids[rows], within[rows])
+            counts.append(np.asarray(counted)[:num])
+        return np.concatenate(counts)
+
+    def curvature(params, sampler_state, table, view_ids, within, progress_fn=None):
+        total = jnp.zeros((grid.num_vertices, 3))
+        counts = all_counts(params, sampler_state, table, view_ids, within)
         report = progress_fn or (lambda num: None)
         report(int((counts == 0).sum()))
         smaller = 0
@@ -103,7 +112,7 @@ def make_curvature_fn(
                 total = add_chunk(
                     total,
                     params,
-                    occupancy,
+                    sampler_state,
                     table,
                     view_ids[rows],
                     within[rows],

@@ -16,7 +16,7 @@ def get_config() -> ConfigDict:
     # --- the experiment ---
     config.policies = ("bavs", "random")  # see --list_policies; the first one's views are exported
     config.seeds = (0,)
-    config.num_initial = 4  # views, drawn from the pool by seed and scene alone
+    config.num_initial = 4  # views, drawn from the pool by seed and scene alone; 0: all of them
     config.batch_size = 4  # views chosen at once
     config.num_rounds = 2  # batches after the initial views; 1 is the paper's single iteration
     config.from_scratch = True  # train anew in each round, or train on
@@ -26,7 +26,12 @@ def get_config() -> ConfigDict:
     config.lpips_net = "alex"  # "alex", "vgg" or "" for none; needs bavs_jax[lpips]
     config.checkpoint_seconds = 30.0  # at most this much work is lost when a run is killed
 
-    # --- the field (fields/hash_grid.py) ---
+    # --- the field and how rays are sampled for it ---
+    config.field_kind = "hash_grid"  # a key of build_field.SAMPLERS
+    # "occupancy", "proposal" or "coarse_to_fine"; "": what suits field and scene.
+    config.sampler_kind = ""
+
+    # --- field_kind "hash_grid" (fields/hash_grid.py) ---
     config.field = ConfigDict()
     config.field.num_levels = 8
     config.field.coarsest = 16  # cells per side of the coarsest level
@@ -36,19 +41,58 @@ def get_config() -> ConfigDict:
     config.field.width = 64
     config.field.geometry_features = 15
     config.field.direction_degree = 2  # spherical-harmonics bands, 1 .. 4
+    config.field.appearance_features = 0  # of a code for each view trained on; 0: none
 
-    # --- rays (rendering/sampling.py) ---
+    # --- field_kind "nerf_mlp", the paper's own (fields/nerf_mlp.py); 8 x 256 in the paper ---
+    config.nerf_mlp = ConfigDict()
+    config.nerf_mlp.depth = 4
+    config.nerf_mlp.width = 64
+    config.nerf_mlp.skip = 3  # hidden layers before the encoding comes in again; 5 in the paper
+    config.nerf_mlp.position_degree = 8  # octaves; 10 in the paper
+    config.nerf_mlp.direction_degree = 4
+
+    # --- field_kind "mip_mlp": the same over cones, with networks as proposals ---
+    config.mip_mlp = ConfigDict()
+    config.mip_mlp.depth = 4
+    config.mip_mlp.width = 64
+    config.mip_mlp.skip = 3
+    config.mip_mlp.position_degree = 10
+    config.mip_mlp.direction_degree = 4
+    config.mip_mlp.proposal_depth = 2
+    config.mip_mlp.proposal_width = 32
+
+    # --- sampler_kind "coarse_to_fine" (rendering/coarse_to_fine.py); 64 and 128 in the paper ---
+    config.coarse_to_fine = ConfigDict()
+    config.coarse_to_fine.num_coarse = 24
+    config.coarse_to_fine.num_fine = 24
+
+    # --- sampler_kind "occupancy" (rendering/sampling.py) ---
     config.march = ConfigDict()
     config.march.num_steps = 192  # steps through the diagonal of the scene box
     config.march.num_slots = 64  # most samples of a ray
     config.march.occupancy_resolution = 64
+
+    # --- sampler_kind "proposal" (rendering/proposals.py) ---
+    config.proposal = ConfigDict()
+    config.proposal.num_proposals = (64, 32)  # samples of each proposal
+    config.proposal.num_samples = 32  # of a ray, where the field is read
+    config.proposal.far = 1000.0  # end of the rays of an unbounded scene, half sides of its box
+    config.proposal.num_levels = 4
+    config.proposal.coarsest = 16
+    config.proposal.finest = (64, 128)  # of each proposal
+    config.proposal.log2_table_size = 14
+    config.proposal.width = 16
+    config.proposal.anneal_steps = 500  # until proposals are fully trusted
+    config.proposal.interlevel_weight = 1.0
+    config.proposal.distortion_weight = 0.002
+    config.proposal.penalty_weight = 0.1  # of the proposals' own penalty
 
     # --- training (training/train.py) ---
     config.train = ConfigDict()
     config.train.num_steps = 3200  # optimiser steps of each round
     config.train.num_rays = 1024
     config.train.capacity = 8192  # samples evaluated in one step
-    config.train.learning_rate = 1e-2
+    config.train.learning_rate = 0.0  # 0: what suits the field kind
     config.train.final_share = 0.1  # of the learning rate, at the end of a round
     config.train.penalty_weight = 0.1  # of the field's own penalty: hash tables stay small
     config.train.steps_per_call = 16  # compiled together

@@ -1,0 +1,188 @@
+"""The paper's own radiance field (Eq 1): a deep network over encoded position and direction.
+
+With `pixel_radius` it reads the mean encoding over the piece of a pixel's cone that a sample stands
+for, as in Mip-NeRF.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from bavs_jax.fields.base import DensityField, Field, no_inputs
+from bavs_jax.fields.contraction import unit_coordinates
+from bavs_jax.fields.positional import cone_variance, integrated_encoding, positional_encoding
+
+
+class Trunk(nn.Module):
+    """Hidden layers over an encoded position; the encoding comes in again after `skip` of them.
+
+    Attributes:
+      depth, width: number of layers and units of each.
+      skip: layers before the encoding is put beside the activations again.
+    """
+
+    depth: int
+    width: int
+    skip: int
+
+    @nn.compact
+    def __call__(self, encoded):
+        hidden = encoded
+        for layer in range(self.depth):
+            hidden = nn.relu(nn.Dense(self.width)(hidden))
+            if layer + 1 == self.skip and layer + 1 < self.depth:
+                hidden = jnp.concatenate([hidden, encoded], axis=-1)
+        return hidden
+
+
+def raw_to_density(raw: jax.Array) -> jax.Array:
+    """`softplus(raw - 1)`, 1 / scene unit: thin at first and never dead, as in Mip-NeRF.
+
+    Differs from the paper's lineage: NeRF has a ReLU, whose gradient vanishes on empty space.
+    """
+    return nn.softplus(raw - 1.0)
+
+
+class NerfMlp(nn.Module):
+    """Density from the trunk; colour from its features and the encoded direction."""
+
+    depth: int
+    width: int
+    skip: int
+
+    def setup(self):
+        self.trunk = Trunk(self.depth, self.width, self.skip)
+        self.density_out = nn.Dense(1)
+        self.features = nn.Dense(self.width)
+        self.colour_hidden = nn.Dense(self.width // 2)
+        self.colour_out = nn.Dense(3)
+
+    def geometry(self, encoded):
+        hidden = self.trunk(encoded)
+        return raw_to_density(self.density_out(hidden)[:, 0]), hidden
+
+    def __call__(self, encoded, encoded_directions):
+        density, hidden = self.geometry(encoded)
+        hidden = jnp.concatenate([self.features(hidden), encoded_directions], axis=-1)
+        return density, nn.sigmoid(self.colour_out(nn.relu(self.colour_hidden(hidden))))
+
+
+class MlpDensity(nn.Module):
+    """Density alone."""
+
+    depth: int
+    width: int
+
+    @nn.compact
+    def __call__(self, encoded):
+        hidden = Trunk(self.depth, self.width, skip=0)(encoded)
+        return raw_to_density(nn.Dense(1)(hidden)[:, 0])
+
+
+def make_position_encoding(
+    box, *, degree: int, contracted: bool, pixel_radius: float | None
+) -> tuple[Callable, Callable]:
+    """How a network reads positions, and what it needs to know of each sample for that.
+
+    Args:
+      box: [2, 3] scene units.
+      degree: octaves.
+      contracted: see `unit_coordinates`.
+      pixel_radius: radius of a pixel's cone at distance 1; None reads points.
+
+    Returns:
+      `encode(positions [K, 3], variance [K, 3] or None)` and the field's `inputs`.
+
+    Raises:
+      ValueError: a cone in contracted space, whose shape is not followed through the contraction.
+    """
+    box = jnp.asarray(box, jnp.float32)
+    if contracted and pixel_radius is not None:
+        raise ValueError("pixel_radius: integrated encodings are for bounded scenes; leave it out")
+
+    def encode(positions, variance=None):
+        centred = 2.0 * unit_coordinates(box, positions, contracted=contracted) - 1.0
+        if pixel_radius is None or variance is None:
+            return positional_encoding(centred, degree)
+        half_sides = 0.5 * (box[1] - box[0])
+        return integrated_encoding(centred, variance / jnp.square(half_sides), degree)
+
+    def inputs(rays, samples, view_ids=None):
+        del view_ids
+        return {"variance": cone_variance(rays, samples, pixel_radius)}
+
+    return encode, no_inputs if pixel_radius is None else inputs
+
+
+def make_nerf_mlp_field(
+    box,
+    *,
+    depth: int = 8,
+    width: int = 256,
+    skip: int = 5,
+    position_degree: int = 10,
+    direction_degree: int = 4,
+    contracted: bool = False,
+    pixel_radius: float | None = None,
+) -> Field:
+    """Makes a NeRF network over a box, or over contracted space around it.
+
+    Args:
+      box: [2, 3] lower and upper corner, scene units.
+      depth, width, skip: see `Trunk`; 8 x 256 with the encoding again after layer 5 in the paper.
+      position_degree, direction_degree: octaves of the encodings, 10 and 4 in the paper.
+      contracted: see `unit_coordinates`.
+      pixel_radius: of a pixel's cone at distance 1, for the integrated encoding; None for points.
+
+    Returns:
+      A `Field`.
+    """
+    encode, inputs = make_position_encoding(
+        box, degree=position_degree, contracted=contracted, pixel_radius=pixel_radius
+    )
+    module = NerfMlp(depth, width, skip)
+
+    def init(key):
+        point, direction = jnp.zeros((1, 3)), jnp.array([[0.0, 0.0, 1.0]])
+        return module.init(key, encode(point), positional_encoding(direction, direction_degree))[
+            "params"
+        ]
+
+    def apply(params, positions, directions, variance=None):
+        encoded_directions = positional_encoding(directions, direction_degree)
+        return module.apply({"params": params}, encode(positions, variance), encoded_directions)
+
+    def density(params, positions, variance=None):
+        encoded = encode(positions, variance)
+        return module.apply({"params": params}, encoded, method=NerfMlp.geometry)[0]
+
+    return Field(init=init, apply=apply, density=density, inputs=inputs)
+
+
+def make_mlp_density(
+    box,
+    *,
+    depth: int = 4,
+    width: int = 256,
+    position_degree: int = 10,
+    contracted: bool = False,
+    pixel_radius: float | None = None,
+) -> DensityField:
+    """Makes a proposal network; the arguments are those of `make_nerf_mlp_field`."""
+    encode, inputs = make_position_encoding(
+        box, degree=position_degree, contracted=contracted, pixel_radius=pixel_radius
+    )
+    module = MlpDensity(depth, width)
+
+    def density(params, positions, variance=None):
+        return module.apply({"params": params}, encode(positions, variance))
+
+    return DensityField(
+        init=lambda key: module.init(key, encode(jnp.zeros((1, 3))))["params"],
+        density=density,
+        inputs=inputs,
+    )

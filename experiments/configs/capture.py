@@ -1,0 +1,21 @@
+"""A real capture: a folder of photographs with their poses, indoors or out of doors.
+
+Training on 50 views of the pool, or on all of it with --config.num_initial=0; then rounds of
+selection with --config.num_rounds. Name the scene: --config.scene=FOLDER.
+"""
+
+from experiments.configs import base
+
+
+def get_config():
+    config = base.get_config()
+    config.loader = "nerfstudio"
+    config.scene = ""
+    config.image_size = 240
+    config.policies = ("bavs",)
+    config.num_initial = 50
+    config.num_rounds = 0
+    config.field.finest = 512
+    config.field.appearance_features = 4
+    config.train.num_steps = 2400
+    return config
