@@ -31,7 +31,12 @@ TINY = {
     "proposal__num_proposals": (12, 8),
     "proposal__num_samples": 8,
     "proposal__log2_table_size": 10,
-    "train__num_rays": 64,
+    "proposal__num_levels": 1,
+    "field__num_levels": 1,
+    "train__num_rays": 128,
+    "train__num_steps": 160,
+    "train__steps_per_call": 16,
+    "train__learning_rate": 5e-3,
 }
 
 
@@ -65,7 +70,7 @@ def test_rounds_run_and_trace_nothing_new(unbounded, field_kind, options):
         losses.append(float(info.loss))
 
     state, _ = step(jax.random.key(1), state, on_call=on_call)
-    assert losses[-1] < losses[0]
+    assert losses[-1] < 0.7 * losses[0]
     state, info = step(jax.random.key(1), state)
     with count_traces() as traces:
         state, info = step(jax.random.key(1), state)
