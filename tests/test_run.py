@@ -52,6 +52,8 @@ def test_results_have_the_agreed_form(finished):
     for run in summary["runs"]:
         keys = {"schema_version", "scene", "policy", "seed", "config", "versions", "device"}
         assert keys <= run.keys() and run["completed"]
+        assert run["baselines"].keys() == {"mean_colour_psnr", "nearest_image_psnr"}
+        assert all(5 < psnr < 40 for psnr in run["baselines"].values())
         assert [r["num_views"] for r in run["rounds"]] == [2, 4, 6]
         for row in run["rounds"]:
             assert np.isfinite([row["psnr"], row["ssim"], row["depth_mae"]]).all()

@@ -1,0 +1,128 @@
+"""The whole loop on every kind of field and sampler, bounded and unbounded."""
+
+import dataclasses
+import io
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bavs_jax.active import init_active_state
+from bavs_jax.fields.hash_grid import make_hash_grid_field
+from bavs_jax.rendering.samplers import dense_samples
+from experiments.build import build_problem, initial_views
+from experiments.errors import ConfigError
+from experiments.progress import track
+from tests.toy_fields import rays_through
+from tests.toy_runs import toy_config
+from tests.toy_scenes import toy_scene
+from tests.traces import count_traces
+
+TINY = {
+    "nerf_mlp__depth": 2,
+    "nerf_mlp__width": 16,
+    "nerf_mlp__skip": 1,
+    "mip_mlp__depth": 2,
+    "mip_mlp__width": 16,
+    "mip_mlp__proposal_width": 8,
+    "coarse_to_fine__num_coarse": 8,
+    "coarse_to_fine__num_fine": 8,
+    "proposal__num_proposals": (12, 8),
+    "proposal__num_samples": 8,
+    "proposal__log2_table_size": 10,
+    "proposal__num_levels": 1,
+    "field__num_levels": 1,
+    "train__num_rays": 128,
+    "train__num_steps": 160,
+    "train__steps_per_call": 16,
+    "train__learning_rate": 5e-3,
+}
+
+
+def tiny_problem(unbounded, **overrides):
+    scene = dataclasses.replace(toy_scene(), unbounded=unbounded)
+    config = toy_config(loader="blender", **TINY, **overrides)
+    return build_problem(config, scene)
+
+
+def silent(total, description, unit):
+    return track(total, description, unit, stream=io.StringIO())
+
+
+@pytest.mark.parametrize(
+    "unbounded, field_kind, options",
+    [
+        (False, "nerf_mlp", {}),
+        (False, "mip_mlp", {}),
+        (True, "hash_grid", {"field__appearance_features": 2}),
+    ],
+)
+def test_rounds_run_and_trace_nothing_new(unbounded, field_kind, options):
+    problem = tiny_problem(unbounded, field_kind=field_kind, **options)
+    initial = initial_views(problem.scene, 0, 2)
+    train = problem.init_train(jax.random.key(0))
+    state = init_active_state(train, problem.table, initial)
+    step = problem.make_step("bavs", initial, silent, "bavs")
+    losses = []
+
+    def on_call(state, info):
+        losses.append(float(info.loss))
+
+    state, _ = step(jax.random.key(1), state, on_call=on_call)
+    assert losses[-1] < 0.7 * losses[0]
+    state, info = step(jax.random.key(1), state)
+    with count_traces() as traces:
+        state, info = step(jax.random.key(1), state)
+    assert info.round == 2 and len(set(info.choice.view_ids.tolist())) == 2
+    assert not set(traces) & {"train", "render_chunk", "count_samples", "add_chunk"}
+    assert int(state.is_training_view.sum()) == 6
+    scores = np.asarray(info.choice.selection.scores)[info.choice.selected]
+    assert np.isfinite(scores).all() and (scores > 0).all()
+
+
+def test_every_kind_learns_a_sampler_beside_the_field():
+    problem = tiny_problem(True, field_kind="nerf_mlp", sampler_kind="proposal")
+    state = problem.init_train(jax.random.key(0))
+    assert set(state.params) == {"field", "sampler"} and len(state.params["sampler"]) == 2
+
+
+@pytest.mark.parametrize(
+    "unbounded, options, message",
+    [
+        (False, {"field_kind": "nerv_mlp"}, "config.field_kind: 'nerv_mlp' is unknown"),
+        (True, {"sampler_kind": "occupancy"}, "'occupancy' does not go with"),
+        (False, {"sampler_kind": "coarse_to_fine"}, "does not go with field_kind 'hash_grid'"),
+        (True, {"field_kind": "mip_mlp"}, "'mip_mlp' is for bounded scenes"),
+        (False, {"sampler_kind": "proposal", "proposal__finest": (64,)}, "config.proposal.finest"),
+    ],
+)
+def test_kinds_that_do_not_go_together_are_errors(unbounded, options, message):
+    with pytest.raises(ConfigError, match=message):
+        tiny_problem(unbounded, **options)
+
+
+def test_views_without_training_are_read_with_the_mean_code():
+    field = make_hash_grid_field(
+        np.array([[-1.0] * 3, [1.0] * 3]),
+        num_levels=1,
+        finest=8,
+        width=8,
+        num_views=4,
+        appearance_features=3,
+    )
+    params = field.init(jax.random.key(0))
+    assert not np.any(params["appearance"])
+    codes = jnp.array([[1.0, 0, 0], [0, 0, 0], [3.0, 2.0, 0], [0, 0, 0]])  # 0 and 2 were trained
+    params = params | {"appearance": codes}
+    mean = params | {"appearance": codes.at[1].set(jnp.array([2.0, 1.0, 0.0]))}
+    x, rays = jnp.zeros((2, 3)), rays_through(jax.random.key(1), 2)
+    _, unseen = field.apply(params, x, rays.directions)
+    _, want = field.apply(mean, x, rays.directions, view_ids=jnp.array([1, 1]))
+    _, first = field.apply(params, x, rays.directions, view_ids=jnp.array([0, 0]))
+    np.testing.assert_allclose(unseen, want, atol=1e-6)
+    assert float(jnp.abs(first - want).max()) > 1e-4
+    samples = dense_samples(jnp.ones((2, 5)), jnp.ones((2, 5)), jnp.zeros(2, bool))
+    assert field.inputs(rays, samples) == {}
+    given = field.inputs(rays, samples, jnp.array([3, 1]))["view_ids"]
+    np.testing.assert_array_equal(given, [[3] * 5, [1] * 5])
