@@ -35,8 +35,13 @@ def evaluate_views(render_fn, scene, view_ids, *, lpips_fn=None, progress_fn=Non
       dict of `psnr` (dB), `ssim`, `lpips`, `depth_mae` (scene units), `num_test_views` and
       `thinned` (share of rays sampled more coarsely than asked for); null where not measured.
     """
+
+    def measured_part(rays):
+        rendering = render_fn(rays)
+        return {name: rendering[name] for name in ("rgb", "depth", "thinned")}
+
     images = render_views(
-        lambda rays: {k: render_fn(rays)[k] for k in ("rgb", "depth", "thinned")},
+        measured_part,
         scene.cameras,
         view_ids,
         chunk=RENDER_CHUNK,
