@@ -83,7 +83,7 @@ def default_config():
     config = base.get_config()
     config.loader, config.image_size = "auto", 135
     config.holdout = 0  # photos left out of training, to measure the field on
-    config.train.num_steps = 3000
+    config.train.num_steps = 1600
     config.lpips_net = ""
     config.checkpoint_seconds = 20.0
     # Every photo's rays weigh in the curvature through a uniform subset, scaled up.
