@@ -35,3 +35,14 @@ def safe_reciprocal(x: jax.Array) -> jax.Array:
     """`1 / x` for ray-box tests: a zero component becomes 1e-12 and keeps its sign."""
     tiny = jnp.where(jnp.signbit(x), -1e-12, 1e-12)
     return 1.0 / jnp.where(jnp.abs(x) < 1e-12, tiny, x)
+
+
+def computed_once(x: jax.Array) -> jax.Array:
+    """`x` [..., D] as it is, but stored where it is used many times.
+
+    XLA for CPUs computes a cheap producer anew inside of each of its consumers, and drops
+    `optimization_barrier` before it does so: positions that 64 gathers read were computed 64
+    times, which took half of a training step. It never does so with a matrix product, and one
+    with the identity, in full precision, changes no value.
+    """
+    return jnp.dot(x, jnp.eye(x.shape[-1], dtype=x.dtype), precision=jax.lax.Precision.HIGHEST)

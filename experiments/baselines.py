@@ -34,7 +34,7 @@ def measure_baselines(scene, training_views, test_views) -> dict[str, float]:
     positions = np.asarray(scene.cameras.positions)
     by_mean, by_nearest = [], []
     for view in test_views:
-        truth, mask = scene.image(view), _mask_image(scene, view)
+        truth, mask = scene.image(view), scene.mask_image(view)
         distance = np.linalg.norm(positions[training_views] - positions[view], axis=-1)
         nearest = scene.image(training_views[distance.argmin()])
         if nearest.shape != truth.shape:
@@ -51,10 +51,3 @@ def measure_baselines(scene, training_views, test_views) -> dict[str, float]:
 def _kept_pixels(scene, view: int) -> np.ndarray:
     rows = scene.pixels[scene.view_slice(view)]
     return rows if scene.pixel_mask is None else rows[scene.pixel_mask[scene.view_slice(view)]]
-
-
-def _mask_image(scene, view: int) -> np.ndarray | None:
-    if scene.pixel_mask is None:
-        return None
-    width, height = (int(n) for n in scene.cameras.sizes[view])
-    return scene.pixel_mask[scene.view_slice(view)].reshape(height, width)

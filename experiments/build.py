@@ -78,7 +78,10 @@ def load_config_scene(config, *, cache_dir: str | None) -> Scene:
             )
         folder = os.path.join(os.environ["BAVS_DATA"], config.loader)
     root = os.path.join(folder, config.scene)
-    return load_scene(config.loader, root=root, image_size=config.image_size, strict=config.strict)
+    options = {name: value for name, value in config.load.items() if value}
+    if options.get("pool_size", 0.0) >= 1:
+        options["pool_size"] = int(options["pool_size"])
+    return load_scene(config.loader, root=root, image_size=config.image_size, **options)
 
 
 def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:

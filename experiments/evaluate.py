@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import jax
 import numpy as np
 
@@ -57,16 +55,20 @@ _measure_images = jax.jit(measure_images, static_argnames="lpips_fn")
 
 
 def _measure(scene, view_id: int, image: dict, lpips_fn) -> dict[str, float]:
+    mask = scene.mask_image(view_id)
+    if mask is not None and not mask.any():
+        return {}
     truth = scene.image(view_id).astype(np.float32) / 255.0
-    row = _measure_images(image["rgb"], truth, lpips_fn=lpips_fn)
-    if scene.depth is not None:
-        row["depth_mae"] = depth_mae(image["depth"], scene.depth_image(view_id))
+    row = _measure_images(image["rgb"], truth, mask=mask, lpips_fn=lpips_fn)
+    true_depth = scene.depth_image(view_id)
+    if true_depth is not None and (true_depth > 0).any():
+        row["depth_mae"] = depth_mae(image["depth"], true_depth)
     return {k: float(v) for k, v in row.items() if v is not None}
 
 
 def _mean(values) -> float | None:
-    """Mean of the values that exist and are numbers: views without depth have no depth error."""
-    known = [value for value in values if value is not None and not math.isnan(value)]
+    """Mean of the values that exist: a view without known depth has no depth error."""
+    known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
 
 

@@ -99,6 +99,21 @@ def test_psnr_agrees_with_scikit_image_and_keeps_leading_axes():
     )
 
 
+def test_masked_pixels_change_no_measure():
+    prediction, truth = _images("smooth")
+    mask = np.ones(truth.shape[:2], bool)
+    mask[3:7, 2:9] = False
+    spoilt = np.where(mask[..., None], prediction, 1.0 - truth)
+    clean, masked = (
+        {k: v for k, v in image.measure_images(p, truth, mask=mask).items() if v is not None}
+        for p in (prediction, spoilt)
+    )
+    assert clean == masked
+    as_files = [np.round(255 * x[mask]).astype(np.uint8) for x in (prediction, truth)]
+    expected = peak_signal_noise_ratio(as_files[1], as_files[0], data_range=255)
+    np.testing.assert_allclose(clean["psnr"], expected, rtol=1e-5)  # float32 sums
+
+
 def test_psnr_of_identical_images_is_infinite():
     _, truth = _images("smooth")
     assert np.isposinf(image.psnr(truth, truth))

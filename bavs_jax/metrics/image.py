@@ -31,21 +31,23 @@ def quantise_uint8(image: jax.Array) -> jax.Array:
     return jnp.round(255.0 * jnp.clip(image, 0.0, 1.0)) / 255.0
 
 
-def psnr(prediction: jax.Array, truth: jax.Array) -> jax.Array:
+def psnr(prediction: jax.Array, truth: jax.Array, mask: jax.Array | None = None) -> jax.Array:
     """Peak signal-to-noise ratio for a data range of 1: `-10 log10(mean (prediction - truth)^2)`.
 
     Args:
       prediction: [..., H, W, 3] in [0, 1].
       truth: [..., H, W, 3] in [0, 1].
+      mask: [..., H, W] bool, the pixels that the mean is over; None for all.
 
     Returns:
-      [...] dB; infinite where the two are identical.
+      [...] dB; infinite where the two are identical, NaN where no pixel counts.
 
     Raises:
       ValueError: the shapes differ or are not those of images.
     """
     _check_images(prediction, truth)
-    mse = jnp.mean(jnp.square(prediction - truth), axis=(-3, -2, -1))
+    where = None if mask is None else mask[..., None]
+    mse = jnp.mean(jnp.square(prediction - truth), axis=(-3, -2, -1), where=where)
     return -10.0 * jnp.log10(mse)
 
 
@@ -88,13 +90,19 @@ def ssim(prediction: jax.Array, truth: jax.Array) -> jax.Array:
 
 
 def measure_images(
-    prediction: jax.Array, truth: jax.Array, *, lpips_fn: Callable | None = None
+    prediction: jax.Array,
+    truth: jax.Array,
+    *,
+    mask: jax.Array | None = None,
+    lpips_fn: Callable | None = None,
 ) -> dict[str, jax.Array | None]:
     """All image measures by the 8-bit protocol: both images are quantised, then compared.
 
     Args:
       prediction: [..., H, W, 3] sRGB as rendered.
       truth: [..., H, W, 3] sRGB in [0, 1].
+      mask: [..., H, W] bool, the pixels that count; None for all. The others leave the PSNR's
+        mean; SSIM and LPIPS, which look at neighbourhoods, see the true colour there.
       lpips_fn: from `perceptual.make_lpips_fn`, or None where it is not installed.
 
     Returns:
@@ -104,8 +112,10 @@ def measure_images(
       ValueError: as `ssim`.
     """
     prediction, truth = quantise_uint8(prediction), quantise_uint8(truth)
+    if mask is not None:
+        prediction = jnp.where(mask[..., None], prediction, truth)
     return {
-        "psnr": psnr(prediction, truth),
+        "psnr": psnr(prediction, truth, mask),
         "ssim": ssim(prediction, truth),
         "lpips": None if lpips_fn is None else lpips_fn(prediction, truth),
     }

@@ -64,6 +64,13 @@ class Scene:
         width, height = (int(n) for n in self.cameras.sizes[view_id])
         return self.depth[self.view_slice(view_id)].reshape(height, width)
 
+    def mask_image(self, view_id: int) -> np.ndarray | None:
+        """Which pixels of a view count, [H, W] bool, or None where all do."""
+        if self.pixel_mask is None:
+            return None
+        width, height = (int(n) for n in self.cameras.sizes[view_id])
+        return self.pixel_mask[self.view_slice(view_id)].reshape(height, width)
+
 
 def pixel_table(images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Stacks images [H_v, W_v, ...] into rows [N, ...] and their offsets [V + 1]."""

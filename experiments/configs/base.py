@@ -11,7 +11,14 @@ def get_config() -> ConfigDict:
     config.data_dir = ""  # folder of scenes; empty: $BAVS_DATA/<loader>
     config.scene = "sculpture"  # folder in data_dir (the procedural scene has just this one)
     config.image_size = 100  # pixels of the image width
-    config.strict = False  # whether a listed image without a file is an error, or a warning
+
+    # --- how its files are read (bavs_jax/scenes); 0 or False: as the loader sees fit ---
+    config.load = ConfigDict()
+    config.load.strict = False  # whether a listed image without a file is an error, or a warning
+    config.load.downscale = 0  # N reads the images of the folder images_N
+    config.load.pool_size = 0.0  # views that may be trained on: a count, or a share below 1
+    config.load.test_every = 0  # instead: every so many-th view is a test view
+    config.load.seed = 0  # draws the pool
 
     # --- the experiment ---
     config.policies = ("bavs", "random")  # see --list_policies; the first one's views are exported
