@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bavs_jax.cameras import look_at
+from bavs_jax.cameras import look_at, make_cameras
 from bavs_jax.placement.clearance import (
     REASONS,
     fibonacci_directions,
@@ -15,6 +15,7 @@ from bavs_jax.placement.clearance import (
 from bavs_jax.placement.collect import PlacementError, Proposals, check_enough, collect_poses
 from bavs_jax.placement.focus import focus_point, share_facing
 from bavs_jax.placement.proposals import aim, box_positions, shell_positions, turned_targets
+from bavs_jax.placement.seen import count_seeing, in_unknown_space
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -156,7 +157,23 @@ def draw_from_box(num=200):
 def judge_ball(poses, bounds=((-1.8, -1.8, -1.8), (1.8, 1.8, 1.8))):
     places = poses[:, :, 3]
     inside, near = judge_positions(places, ball_density, clearance=0.2, solid_density=1.0)
-    return np.select([~within_bounds(places, bounds), inside, near], [0, 1, 2], -1)
+    unseen = in_unknown_space(places, one_camera(), ball_density, reach=1.0)
+    return np.select([~within_bounds(places, bounds), inside, near, unseen], [0, 1, 2, 3], -1)
+
+
+def one_camera():
+    """At (3, 0, 0), with all of the ball in its image."""
+    return make_cameras(look_at([3.0, 0.0, 0.0], [0.0, 0.0, 0.0])[None], [[9, 9, 8, 8]], [[16, 16]])
+
+
+def test_unknown_space_is_what_no_camera_sees_or_stands_near():
+    behind_the_ball, before_it, behind_the_camera = [-1.5, 0, 0], [1.5, 0, 0], [3.5, 0, 0]
+    places = np.array([behind_the_ball, before_it, behind_the_camera], float)
+    got = in_unknown_space(places, one_camera(), ball_density, reach=1.0)
+    np.testing.assert_array_equal(got, [True, False, False])
+    closer = in_unknown_space(places, one_camera(), ball_density, reach=0.1)
+    np.testing.assert_array_equal(closer, [True, False, True])
+    assert [count_seeing(one_camera(), place, ball_density) for place in places] == [0, 1, 0]
 
 
 def test_collected_poses_are_allowed_and_every_rejection_is_counted():

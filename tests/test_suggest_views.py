@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bavs_jax.cameras import make_cameras
+from bavs_jax.cameras import make_cameras, take
 from bavs_jax.placement.collect import PlacementError
+from bavs_jax.placement.seen import count_seeing
 from bavs_jax.scenes.poses import user_transforms
 from bavs_jax.selection.context import SelectionError
 from bavs_jax.selection.policies import POLICIES
@@ -157,14 +158,15 @@ def test_where_high_pixels_gather():
 
 def test_photos_see_what_is_before_them_and_not_behind_the_ball():
     scene = toy_scene()  # cameras at azimuths 0, 30, ... of the pool of 9
+    cameras = take(scene.cameras, scene.pool)
     beside = np.array([0.0, 0.0, 0.95])  # above the ball, in sight of every photo
     behind = np.asarray(scene.cameras.positions)[0] * 5.0
-    assert facts.count_seeing(scene, beside, ball) == len(scene.pool)
-    assert facts.count_seeing(scene, np.zeros(3), ball) == 0
+    assert count_seeing(cameras, beside, ball) == len(scene.pool)
+    assert count_seeing(cameras, np.zeros(3), ball) == 0
     direction = -np.asarray(scene.cameras.positions)[0]
     shadow = 0.75 * direction / np.linalg.norm(direction)  # hidden from photo 0 by the ball
-    assert 0 < facts.count_seeing(scene, shadow, ball) < len(scene.pool)
-    assert facts.count_seeing(scene, behind, ball) < len(scene.pool)
+    assert 0 < count_seeing(cameras, shadow, ball) < len(scene.pool)
+    assert count_seeing(cameras, behind, ball) < len(scene.pool)
 
 
 def test_worth_in_words():

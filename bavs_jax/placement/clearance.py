@@ -9,7 +9,7 @@ import numpy as np
 
 NUM_DIRECTIONS = 128
 SHELLS = (0.25, 0.5, 0.75, 1.05)  # of the clearance
-REASONS = ("out of bounds", "inside matter", "too near to matter")
+REASONS = ("out of bounds", "inside matter", "too near to matter", "in unseen space")
 
 
 def matter_density(half_length: float) -> float:

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bavs_jax.cameras import Cameras
-from bavs_jax.placement.clearance import optical_depth
+from bavs_jax.cameras import Cameras, take
+from bavs_jax.placement.seen import count_seeing
 from bavs_jax.scenes import Scene
 from experiments.suggest.places import Surroundings
 
@@ -73,7 +73,8 @@ def pose_facts(
       density_fn: points [K, 3] -> density [K], scene units.
     """
     high = np.percentile(photo_uncertainty, RARE)
-    photos = np.asarray(scene.cameras.world_from_cam, np.float64)[scene.pool]
+    pool_cameras = take(scene.cameras, scene.pool)
+    photos = np.asarray(pool_cameras.world_from_cam, np.float64)
     facts = []
     for pose, image in zip(np.asarray(cameras.world_from_cam, np.float64), images):
         distances = np.linalg.norm(photos[:, :, 3] - pose[:, 3], axis=-1)
@@ -88,7 +89,7 @@ def pose_facts(
                 nearest_distance=around.unit * float(distances[nearest]),
                 turned=float(np.degrees(np.arccos(cosine))),
                 bearing=bearing(pose[:, 3], photos[:, :, 3], around, scene.up),
-                num_seeing=count_seeing(scene, pose[:, 3], density_fn),
+                num_seeing=count_seeing(pool_cameras, pose[:, 3], density_fn),
             )
         )
     return facts
@@ -128,25 +129,6 @@ def bearing(position, photo_positions, around: Surroundings, up) -> str:
     angle = np.degrees(np.arctan2(flat @ left, -(flat @ forward)))
     side = "left" if angle >= 0 else "right"
     return f"{abs(angle):.0f}° to the {side} of the photos' middle and {height} it"
-
-
-def count_seeing(scene: Scene, position, density_fn: Callable) -> int:
-    """How many photos have a place in their image, with at least half of its light unhidden.
-
-    Numerics: lens distortion is left out, which moves the image's edge by a few pixels.
-    """
-    cameras, pool = scene.cameras, scene.pool
-    poses = np.asarray(cameras.world_from_cam, np.float64)[pool]
-    local = np.einsum("vij,vi->vj", poses[:, :, :3], position - poses[:, :, 3])
-    depth = -local[:, 2]
-    fx, fy, cx, cy = np.asarray(cameras.intrinsics, np.float64)[pool].T
-    safe = np.where(depth > 0.0, depth, 1.0)
-    x, y = cx + fx * local[:, 0] / safe, cy - fy * local[:, 1] / safe
-    width, height = np.asarray(cameras.sizes)[pool].T
-    in_image = (depth > 0.0) & (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
-    # All photos at once, so that the field is compiled for one shape.
-    depths = optical_depth(density_fn, poses[:, :, 3], np.broadcast_to(position, (len(pool), 3)))
-    return int((in_image & (depths < np.log(2.0))).sum())
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from bavs_jax.placement.clearance import judge_positions, matter_density, within
 from bavs_jax.placement.collect import check_enough, collect_poses
 from bavs_jax.placement.focus import focus_point, share_facing
 from bavs_jax.placement.proposals import aim, box_positions, shell_positions, turned_targets
+from bavs_jax.placement.seen import in_unknown_space
 from bavs_jax.scenes import Scene
 from bavs_jax.scenes.normalise import transform_poses
 from bavs_jax.scenes.pose_files import read_pose_file
@@ -25,6 +26,7 @@ FIXES = {
     "inside matter": "move --bounds or the poses into free space, or lower --holdout and raise "
     "--train_steps if the field is foggy",
     "too near to matter": "lower --clearance",
+    "in unseen space": "raise --spread, or name the free space by --candidates=box and --bounds",
     "": "list more poses, or lower --num_views",
 }
 
@@ -97,7 +99,16 @@ def propose(scene: Scene, density_fn: Callable, around: Surroundings, options: O
         )
         in_bounds = within_bounds(around.to_user(positions), options.bounds)
         # The first reason counts, in the order of `clearance.REASONS`.
-        return np.select([~in_bounds, inside, near], [0, 1, 2], -1)
+        reason = np.select([~in_bounds, inside, near], [0, 1, 2], -1)
+        if options.candidates == "shell":
+            # The other kinds are places that the user has named.
+            left = np.flatnonzero(reason < 0)
+            reach = options.spread * around.distance
+            unseen = in_unknown_space(positions[left], photos, density_fn, reach=reach)
+            reason[left[unseen]] = 3
+        return reason
+
+    photos = take(scene.cameras, scene.pool)
 
     draw = _make_draw_fn(scene, around, options)
     wanted = options.num_candidates

@@ -1,0 +1,56 @@
+"""Which places the photos have looked at: what nobody has seen may be free or not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from bavs_jax.cameras import Cameras
+from bavs_jax.placement.clearance import optical_depth
+
+
+def count_seeing(cameras: Cameras, position, density_fn: Callable) -> int:
+    """How many cameras have a place in their image, with at least half of its light unhidden.
+
+    Args:
+      cameras: [V].
+      position: [3] scene units.
+      density_fn: points [K, 3] -> density [K], 1 / scene unit.
+
+    Numerics: lens distortion is left out, which moves the image's edge by a few pixels.
+    """
+    poses = np.asarray(cameras.world_from_cam, np.float64)
+    local = np.einsum("vij,vi->vj", poses[:, :, :3], position - poses[:, :, 3])
+    depth = -local[:, 2]
+    fx, fy, cx, cy = np.asarray(cameras.intrinsics, np.float64).T
+    safe = np.where(depth > 0.0, depth, 1.0)
+    x, y = cx + fx * local[:, 0] / safe, cy - fy * local[:, 1] / safe
+    width, height = np.asarray(cameras.sizes).T
+    in_image = (depth > 0.0) & (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
+    if not in_image.any():
+        return 0
+    # All cameras at once, so that the field is compiled for one shape.
+    ends = np.broadcast_to(position, poses[:, :, 3].shape)
+    return int((in_image & (optical_depth(density_fn, poses[:, :, 3], ends) < np.log(2.0))).sum())
+
+
+def in_unknown_space(positions, cameras: Cameras, density_fn: Callable, *, reach: float):
+    """Which places no camera sees and none stands near, [N] bool.
+
+    A field says nothing about space that no photo looks into: it is free there because nothing
+    told it otherwise. Only the neighbourhood of a camera is known to be free without a look.
+
+    Args:
+      positions: [N, 3] scene units.
+      cameras: [V].
+      density_fn: see `count_seeing`.
+      reach: radius around each camera that counts as known, scene units.
+    """
+    positions = np.asarray(positions, np.float64)
+    standing = np.asarray(cameras.world_from_cam, np.float64)[:, :, 3]
+    unknown = np.zeros(len(positions), bool)
+    for i, position in enumerate(positions):
+        if np.linalg.norm(standing - position, axis=-1).min() > reach:
+            unknown[i] = count_seeing(cameras, position, density_fn) == 0
+    return unknown
