@@ -74,7 +74,10 @@ def main() -> None:
     except OSError as error:
         # The config file is only read when it is first used.
         sys.exit(f"error: {' '.join(str(error).split())}")
-    except (SceneError, SelectionError, ConfigError, workdir.WorkdirError) as error:
+    except (
+        *(SceneError, SelectionError, ConfigError, workdir.WorkdirError),
+        FloatingPointError,
+    ) as error:
         sys.exit(f"error: {error}")
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import pathlib
-import shutil
 
-from experiments.files import write_json
+from experiments.files import write_atomic, write_json
 
 SUMMARY_VERSION = 1
 # What may differ when a folder is taken up again: more policies or seeds add runs.
@@ -64,8 +63,5 @@ def export_next_views(workdir: pathlib.Path, policy: str, seed: int) -> pathlib.
     """Copies one run's chosen poses to `next_views/transforms.json`."""
     source = workdir / policy / f"seed_{seed}" / "next_views" / "transforms.json"
     target = workdir / "next_views" / "transforms.json"
-    target.parent.mkdir(exist_ok=True)
-    temporary = target.with_suffix(".tmp")
-    shutil.copyfile(source, temporary)
-    temporary.replace(target)
+    write_atomic(target, lambda file: file.write(source.read_bytes()))
     return target

@@ -3,21 +3,22 @@
 python -m experiments.report --workdir=runs/quickstart
 """
 
-from absl import app, flags
+import sys
 
+from absl import flags
+
+from experiments import runtime
 from experiments.report import ReportError, write_report
 
-_WORKDIR = flags.DEFINE_string("workdir", None, "Folder with summary.json.", required=True)
+WORKDIR = flags.DEFINE_string("workdir", None, "Folder with summary.json.", required=True)
 
 
-def main(argv):
-    if len(argv) > 1:
-        raise app.UsageError(f"unknown argument {argv[1]!r}; use --workdir=FOLDER")
+def main() -> None:
     try:
-        print(write_report(_WORKDIR.value))
+        print(write_report(WORKDIR.value))
     except ReportError as error:
-        raise SystemExit(f"error: {error}") from error
+        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":
-    app.run(main)
+    runtime.run_script(main)
