@@ -10,6 +10,7 @@ from bavs_jax.selection import policies
 from bavs_jax.selection.batch import acquire
 from bavs_jax.selection.context import SelectionError, make_context
 from bavs_jax.selection.distances import pairwise_distances
+from bavs_jax.selection.information import Information, make_cached_curvature_fn
 from bavs_jax.selection.policies import POLICIES, get_policy
 from bavs_jax.selection.policies.farthest import make_farthest
 from bavs_jax.selection.policy import MODES
@@ -31,8 +32,20 @@ def curvature_sources(view_ids, *, ties):
     return {"mean_uncertainty_fn": mean_uncertainty}
 
 
+def information_sources(view_ids, *, ties):
+    """Stands in for the curvature of the renders: a sparse one that depends on the view alone."""
+    num_vertices = 40
+
+    def dense(index):
+        rng = np.random.default_rng(0 if ties else int(view_ids[index]))
+        return rng.exponential(size=(num_vertices, 3)) * (rng.uniform(size=(num_vertices, 1)) < 0.3)
+
+    curvature_fn = make_cached_curvature_fn(dense, num_vertices=num_vertices, max_bytes=2**20)
+    return {"information": Information(np.full((num_vertices, 3), 0.1, np.float32), curvature_fn)}
+
+
 # What a caller makes for each word in `needs`: (view_ids, *, ties) -> fields of `Context`.
-SOURCES = {"curvature": curvature_sources}
+SOURCES = {"curvature": curvature_sources, "information": information_sources}
 
 
 def pool_context(policy, *, seed=0, num_training=NUM - NUM_CANDIDATES, order=None, ties=False):

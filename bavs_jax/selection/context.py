@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -36,6 +37,8 @@ class Context:
     centre: jax.Array  # [3] scene centre, scene units
     # Eq 15: candidate indices int [n] -> mean uncertainty of each one's render, float [n].
     mean_uncertainty_fn: Callable | None = struct.field(pytree_node=False, default=None)
+    # `information.Information`: precision of the field now, curvature that each candidate adds.
+    information: Any = struct.field(pytree_node=False, default=None)
 
 
 def make_context(
@@ -47,6 +50,7 @@ def make_context(
     view_ids=None,
     mask=None,
     mean_uncertainty_fn: Callable | None = None,
+    information: Any = None,
 ) -> Context:
     """Checks and builds a `Context`, on the host.
 
@@ -58,6 +62,7 @@ def make_context(
       view_ids: [C] distinct integers >= 0; default 0 .. C - 1.
       mask: [C] bool, which candidates may be picked; default all.
       mean_uncertainty_fn: Eq 15 for given candidates, indices [n] -> [n].
+      information: `information.Information` of the field and the candidates.
 
     Returns:
       A `Context` with nothing picked yet.
@@ -90,7 +95,12 @@ def make_context(
     view_ids = arrays["view_ids"]
     if len(np.unique(view_ids)) != num or (view_ids < 0).any():
         raise SelectionError("view_ids: must be distinct and >= 0, for they settle ties")
-    return Context(**arrays, picked=np.zeros(num, bool), mean_uncertainty_fn=mean_uncertainty_fn)
+    return Context(
+        **arrays,
+        picked=np.zeros(num, bool),
+        mean_uncertainty_fn=mean_uncertainty_fn,
+        information=information,
+    )
 
 
 def require(ctx: Context, field: str):

@@ -1,0 +1,57 @@
+"""Evenly spaced views: a farthest-point order of the whole pool, fixed in advance."""
+
+import jax
+import jax.numpy as jnp
+
+from bavs_jax.selection.distances import farthest_ranks, pairwise_distances
+from bavs_jax.selection.policy import Policy
+
+
+def uniform_ranks(positions, view_ids):
+    """Place of each camera in the farthest-point order of all of them.
+
+    The order begins with the camera nearest to their mean position, the middle of a front-facing
+    capture, and goes on with the one farthest from all before it; ties go to the smallest view id.
+
+    Args:
+      positions: [C, 3] scene units.
+      view_ids: [C] int, distinct.
+
+    Returns:
+      [C] int32, a permutation of 0 .. C - 1.
+    """
+    by_id = jnp.argsort(view_ids)  # also the order of summing, so that no other order matters
+    points = positions[by_id]
+    first = jnp.argmin(pairwise_distances(points, points.mean(axis=0)[None])[:, 0])
+    later = farthest_ranks(
+        points,
+        points[first][None],
+        jnp.ones(1, bool),
+        jnp.arange(len(points)) != first,
+        len(points) - 1,
+        view_ids=view_ids[by_id],
+    )
+    ranks = (later + 1).at[first].set(0)
+    return jnp.zeros_like(ranks).at[by_id].set(ranks)
+
+
+_ranks_fn = jax.jit(uniform_ranks)  # compiled once per number of candidates
+
+
+def score(key, ctx):
+    """Minus each candidate's place in the fixed order.
+
+    The order is of all candidates, `ctx.mask` left aside. With a dataset these are the whole pool
+    in every round, so that the order never depends on what has been taken; views that are only
+    tested on, which `ctx.training_positions` may hold too, have no place in it. Candidates that
+    are drawn anew are spread among themselves.
+    """
+    del key
+    return -_ranks_fn(ctx.positions, ctx.view_ids)
+
+
+POLICY = Policy(
+    name="uniform",
+    summary="Evenly spaced: the next views of a farthest-point order of the whole pool.",
+    score_fn=score,
+)
