@@ -21,7 +21,7 @@ from bavs_jax.selection.context import make_context
 from bavs_jax.selection.policy import Policy
 from bavs_jax.training.batches import PixelTable
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.streaming import training_pixels
+from bavs_jax.uncertainty.model import Situation
 
 
 @struct.dataclass
@@ -42,7 +42,7 @@ class Choice(NamedTuple):
     selected: np.ndarray  # [k] the same as indices of the candidates
     candidates: Candidates
     selection: SelectionInfo
-    seconds: dict[str, float]  # curvature, score, select
+    seconds: dict[str, float]  # curvature, fit, score, select
 
 
 class RoundInfo(NamedTuple):
@@ -59,14 +59,12 @@ class Stages(NamedTuple):
     `train_call(key, train_state, table, is_training_view) -> (train_state, TrainInfo)`
     `restart(key, train_state) -> train_state` at the start of each round after the first: a fresh
       optimiser, and fresh parameters too where each round trains from scratch.
-    `curvature(train_state, table, view_ids [N], within [N]) -> jac_sq_sum`
-    `make_score_fn(train_state, jac_sq_sum, cameras) -> (indices [n] -> scores [n])`
+    `sources(policy, key, situation, candidates) -> Sources` (see `sources.py`)
     """
 
     train_call: Callable
     restart: Callable
-    curvature: Callable
-    make_score_fn: Callable
+    sources: Callable
 
 
 def init_active_state(train: TrainState, table: PixelTable, initial_views) -> ActiveState:
@@ -90,9 +88,10 @@ def make_active_step(
     centre,
     batch_size: int,
     calls_per_round: int,
-    max_curvature_rays: int | None = None,
+    num_rays: int,
     radii=None,
     mode: str | None = None,
+    label: str = "",
 ) -> Callable:
     """Makes `step(key, state, on_choice=None, on_call=None) -> (state, RoundInfo)`.
 
@@ -102,48 +101,25 @@ def make_active_step(
 
     Args:
       policy: who chooses.
-      stages: how to train, differentiate and score.
+      stages: how to train, and where the policy's numbers come from.
       source: where candidates come from.
       centre: [3] scene centre, scene units.
       batch_size: views chosen at once.
       calls_per_round: compiled training calls of a round.
-      max_curvature_rays: if there are more training rays than this, a uniform subset of so many
-        stands for them and its sum is scaled up.
+      num_rays: R of Eq 13, the training rays of round 0.
       radii: of the max-min distance filter; by default from the cameras.
       mode: "top_k" or "greedy"; by default the policy's own.
+      label: of the run, for progress.
 
     A step raises FloatingPointError if the loss is not finite, before the state is handed on.
     """
 
-    def curvature(key, state):
-        view_ids, within = training_pixels(state.table, state.is_training_view)
-        scale = 1.0
-        if max_curvature_rays is not None and len(view_ids) > max_curvature_rays:
-            seed = int(jax.random.randint(key, (), 0, 2**31 - 1))
-            rows = np.random.default_rng(seed).permutation(len(view_ids))[:max_curvature_rays]
-            scale = len(view_ids) / max_curvature_rays
-            view_ids, within = view_ids[np.sort(rows)], within[np.sort(rows)]
-        return scale * stages.curvature(state.train, state.table, view_ids, within)
-
     def choose(key, state):
-        propose_key, curvature_key, policy_key = jax.random.split(key, 3)
-        seconds = dict.fromkeys(("curvature", "score", "select"), 0.0)
+        propose_key, source_key, policy_key = jax.random.split(key, 3)
         candidates = source.propose(propose_key, state.table, state.is_training_view)
-
+        situation = Situation(state.train, state.table, state.is_training_view, num_rays, label)
         start = time.perf_counter()
-        jac_sq_sum = None
-        if "curvature" in policy.needs:
-            jac_sq_sum = jax.block_until_ready(curvature(curvature_key, state))
-            seconds["curvature"] = time.perf_counter() - start
-
-        def score(indices):
-            score_start = time.perf_counter()
-            fn = stages.make_score_fn(state.train, jac_sq_sum, candidates.cameras)
-            scores = fn(indices)
-            seconds["score"] += time.perf_counter() - score_start
-            return scores
-
-        start = time.perf_counter()
+        sources = stages.sources(policy, source_key, situation, candidates)
         context = make_context(
             candidates.cameras.positions,
             view_ids=candidates.view_ids,
@@ -151,12 +127,13 @@ def make_active_step(
             training_positions=state.table.cameras.positions,
             is_training_view=state.is_training_view,
             centre=centre,
-            mean_uncertainty_fn=score,
+            **sources.fields,
         )
         selected, selection = acquire(
             policy, policy_key, context, batch_size, radii=radii, mode=mode
         )
-        seconds["select"] = time.perf_counter() - start - seconds["score"]
+        elapsed = time.perf_counter() - start
+        seconds = {**sources.seconds, "select": elapsed - sum(sources.seconds.values())}
         table, view_ids = source.acquire(state.table, state.is_training_view, candidates, selected)
         state = state.replace(
             table=table,

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 MAX_LOG_DENSITY = 12.0
+MIN_VARIANCE = 0.01  # of a point's colour, where a field learns one
 
 
 @jax.custom_jvp
@@ -23,6 +24,11 @@ def density_from_raw(raw: jax.Array) -> jax.Array:
 def _density_from_raw_jvp(primals, tangents):
     density = density_from_raw(primals[0])
     return density, density * tangents[0]
+
+
+def point_variance(raw: jax.Array) -> jax.Array:
+    """Variance of a point's colour, `softplus(raw) + 0.01`, from a network output (ActiveNeRF)."""
+    return jax.nn.softplus(raw) + MIN_VARIANCE
 
 
 def safe_divide(numerator: jax.Array, denominator: jax.Array) -> jax.Array:

@@ -20,7 +20,8 @@ from bavs_jax.scenes import SceneError
 from bavs_jax.selection.context import SelectionError
 from bavs_jax.selection.policies import POLICIES, get_policy
 from experiments import runtime, workdir
-from experiments.build import ConfigError, build_problem, load_config_scene
+from experiments.build import ConfigError, build_problem
+from experiments.build_scene import load_config_scene
 from experiments.report import write_report
 from experiments.runner import Run
 
@@ -39,19 +40,20 @@ flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the nex
 
 def run_all(config, folder: pathlib.Path, command: str) -> None:
     """All policies and seeds of a config, then the summary, the exported views and the report."""
-    for policy in config.policies:
-        get_policy(policy)
+    kinds = {policy: get_policy(policy).field_kind for policy in config.policies}
     folder.mkdir(parents=True, exist_ok=True)
     workdir.claim(folder, config)
     start = time.monotonic()
     scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
     print(f"{scene.name}: {len(scene.pool)} views to choose from, {len(scene.test)} test views")
-    problem = build_problem(config, scene)
+    problems = {kind: build_problem(config, scene, kind) for kind in kinds.values()}
     for seed in config.seeds:
-        shared = Run(config, problem, folder, None, seed, command)
-        shared.finish()
-        for policy in config.policies:
-            Run(config, problem, folder, policy, seed, command).finish(shared)
+        first_rounds = {}
+        for policy, kind in kinds.items():
+            if kind not in first_rounds:
+                first_rounds[kind] = Run(config, problems[kind], folder, None, seed, command)
+                first_rounds[kind].finish()
+            Run(config, problems[kind], folder, policy, seed, command).finish(first_rounds[kind])
             workdir.collect(folder)
     next_views = workdir.export_next_views(folder, config.policies[0], config.seeds[0])
     report = write_report(folder)

@@ -27,13 +27,16 @@ SAMPLERS = {
 LEARNING_RATES = {"hash_grid": 1e-2, "nerf_mlp": 1e-3, "mip_mlp": 1e-3}
 
 
-def build_field(config, scene: Scene, num_views: int) -> tuple[Field, Sampler]:
+def build_field(
+    config, scene: Scene, num_views: int, *, learned_variance: bool = False
+) -> tuple[Field, Sampler]:
     """The radiance field that a config names, and how rays are sampled for it.
 
     Args:
       config: see `experiments/configs/base.py`.
       scene: the scene; an unbounded one is contracted, and sampled by proposals.
       num_views: views of the pixel table, some of them possibly still empty.
+      learned_variance: whether the field also learns a variance of its colours.
 
     Raises:
       ConfigError: an unknown kind, or kinds that do not go together.
@@ -60,16 +63,19 @@ def build_field(config, scene: Scene, num_views: int) -> tuple[Field, Sampler]:
         sampler = _proposal_sampler(config, scene)
     else:
         sampler = _coarse_to_fine_sampler(config, scene)
-    return _make_field(config, scene, num_views), sampler
+    return _make_field(config, scene, num_views, learned_variance), sampler
 
 
-def _make_field(config, scene: Scene, num_views: int) -> Field:
+def _make_field(config, scene: Scene, num_views: int, learned_variance: bool) -> Field:
+    common = {"learned_variance": learned_variance}
     if config.field_kind == "hash_grid":
         return make_hash_grid_field(
-            scene.box, contracted=scene.unbounded, num_views=num_views, **config.field
+            scene.box, contracted=scene.unbounded, num_views=num_views, **config.field, **common
         )
     if config.field_kind == "nerf_mlp":
-        return make_nerf_mlp_field(scene.box, contracted=scene.unbounded, **config.nerf_mlp)
+        return make_nerf_mlp_field(
+            scene.box, contracted=scene.unbounded, **config.nerf_mlp, **common
+        )
     options = config.mip_mlp
     return make_nerf_mlp_field(
         scene.box,
@@ -79,6 +85,7 @@ def _make_field(config, scene: Scene, num_views: int) -> Field:
         position_degree=options.position_degree,
         direction_degree=options.direction_degree,
         pixel_radius=_pixel_radius(scene),
+        **common,
     )
 
 

@@ -16,10 +16,12 @@ import numpy as np
 
 from bavs_jax.active import ActiveState, Choice, init_active_state
 from bavs_jax.training.checkpoints import Checkpoints
+from bavs_jax.uncertainty.model import RECONSTRUCTION
 from bavs_jax.uncertainty.streaming import training_pixels
 from experiments import acquisitions
 from experiments.baselines import measure_baselines
-from experiments.build import Problem, initial_views, run_key
+from experiments.build import Problem, run_key
+from experiments.build_scene import initial_views
 from experiments.evaluate import evaluate_views, picture_arrays, spread_evenly
 from experiments.files import append_line, write_arrays, write_json
 from experiments.progress import track
@@ -32,8 +34,8 @@ LOG_EVERY = 10  # training calls between two lines of metrics.jsonl
 class Run:
     """Drives the active step for one policy and seed, and keeps the run's files up to date.
 
-    Round 0 is the same for all policies of a seed: it is made once, in `initial/seed_<n>`, by a
-    `Run` whose policy is None.
+    Round 0 is the same for all policies of a seed that train the same kind of field: it is made
+    once, in `initial/seed_<n>` or `initial_<kind>/seed_<n>`, by a `Run` whose policy is None.
     """
 
     def __init__(self, config, problem: Problem, workdir: pathlib.Path, policy, seed, command=""):
@@ -41,7 +43,8 @@ class Run:
         self.command = command
         self.policy, self.seed = policy, seed
         self.label = f"{policy or 'initial'} seed {seed}"
-        self.folder = workdir / (policy or "initial") / f"seed_{seed}"
+        own = "initial" if problem.kind == RECONSTRUCTION else f"initial_{problem.kind}"
+        self.folder = workdir / (policy or own) / f"seed_{seed}"
         self.initial = initial_views(problem.scene, seed, config.num_initial)
         self.rounds: list[dict] = []  # of result.json
         self.pending = _new_pending()  # what is known of the round under way
@@ -243,7 +246,7 @@ class Run:
 
 
 def _new_pending() -> dict:
-    names = ("train", "curvature", "score", "select", "evaluate")
+    names = ("train", "curvature", "fit", "score", "select", "evaluate")
     return {"selected": [], "seconds": dict.fromkeys(names, 0.0)}
 
 

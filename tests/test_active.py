@@ -12,7 +12,8 @@ from bavs_jax.candidates import captured_candidates, dataset_candidates, with_em
 from bavs_jax.selection.policies import POLICIES
 from bavs_jax.training.batches import make_pixel_table
 from bavs_jax.training.checkpoints import Checkpoints
-from experiments.build import build_problem, initial_views, load_config_scene
+from experiments.build import build_problem
+from experiments.build_scene import initial_views, load_config_scene
 from experiments.progress import track
 from experiments.runner import saved_part, whole_state
 from tests.toy_runs import toy_config

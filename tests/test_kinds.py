@@ -11,7 +11,8 @@ import pytest
 from bavs_jax.active import init_active_state
 from bavs_jax.fields.hash_grid import make_hash_grid_field
 from bavs_jax.rendering.samplers import dense_samples
-from experiments.build import build_problem, initial_views
+from experiments.build import build_problem
+from experiments.build_scene import initial_views
 from experiments.errors import ConfigError
 from experiments.progress import track
 from tests.toy_fields import rays_through

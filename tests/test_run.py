@@ -58,7 +58,14 @@ def test_results_have_the_agreed_form(finished):
         for row in run["rounds"]:
             assert np.isfinite([row["psnr"], row["ssim"], row["depth_mae"]]).all()
             assert row["lpips"] is None and len(row["selected"]) == 2
-            assert row["seconds"].keys() == {"train", "curvature", "score", "select", "evaluate"}
+            assert row["seconds"].keys() == {
+                "train",
+                "curvature",
+                "fit",
+                "score",
+                "select",
+                "evaluate",
+            }
         assert [r["num_test_views"] for r in run["rounds"]] == [2, 2, 3]
     bavs, random = summary["runs"]
     assert bavs["rounds"][0] == random["rounds"][0]  # round 0 is shared

@@ -102,7 +102,7 @@ def test_filter_goes_before_the_score():
     positions = np.array([[0.0, 0, 10], [0.1, 0, 10], [10, 0, 0], [0, 10, 0]])
     asked = []
 
-    def uncertainty(indices):
+    def uncertainty(indices, picked):
         asked.extend(indices.tolist())
         return np.array([9.0, 8.0, 2.0, 1.0])[indices]
 
@@ -247,7 +247,7 @@ def test_nan_score_outside_of_the_candidates_is_no_matter():
 def test_wrong_number_of_scores():
     with pytest.raises(SelectionError, match=r"scores: shape \(3,\), but it must be \(20,\)"):
         acquire(policy_of(np.zeros(3)), KEY, pool_context(0), 2)
-    ctx = pool_context(0, mean_uncertainty_fn=lambda indices: np.zeros((len(indices), 2)))
+    ctx = pool_context(0, mean_uncertainty_fn=lambda indices, picked: np.zeros((len(indices), 2)))
     with pytest.raises(SelectionError, match=r"\(17, 2\) for 17 candidates"):
         acquire(POLICIES["bavs_topk"], KEY, ctx, 2)
 

@@ -25,7 +25,7 @@ every_policy = pytest.mark.parametrize("policy", POLICIES.values(), ids=POLICIES
 def curvature_sources(view_ids, *, ties):
     """Stands in for the renders: an uncertainty that depends on the view alone."""
 
-    def mean_uncertainty(indices):
+    def mean_uncertainty(indices, picked):
         ids = np.asarray(view_ids)[indices]
         return np.zeros(len(ids)) if ties else np.random.default_rng(7).permutation(100)[ids] / 100
 
@@ -44,8 +44,18 @@ def information_sources(view_ids, *, ties):
     return {"information": Information(np.full((num_vertices, 3), 0.1, np.float32), curvature_fn)}
 
 
+def true_error_sources(view_ids, *, ties):
+    """Stands in for photos of the candidates."""
+    fn = curvature_sources(view_ids, ties=ties)["mean_uncertainty_fn"]
+    return {"true_error_fn": lambda indices: fn(indices, None)}
+
+
 # What a caller makes for each word in `needs`: (view_ids, *, ties) -> fields of `Context`.
-SOURCES = {"curvature": curvature_sources, "information": information_sources}
+SOURCES = {
+    "mean_uncertainty_fn": curvature_sources,
+    "information": information_sources,
+    "true_error_fn": true_error_sources,
+}
 
 
 def pool_context(policy, *, seed=0, num_training=NUM - NUM_CANDIDATES, order=None, ties=False):

@@ -315,7 +315,7 @@ def test_wrong_folder_ends_in_one_line(finished, tmp_path):
 def test_a_policy_that_is_unknown_or_needs_more_than_a_curvature_is_refused(monkeypatch):
     with pytest.raises(SelectionError, match="bavz"):
         choosing.check_policy("bavz")
-    greedy = POLICIES["bavs"]._replace(needs=frozenset({"curvature", "ensemble"}))
+    greedy = POLICIES["bavs"]._replace(needs=frozenset({"mean_uncertainty_fn", "true_error_fn"}))
     monkeypatch.setitem(POLICIES, "bavs", greedy)
-    with pytest.raises(SelectionError, match="needs ensemble"):
+    with pytest.raises(SelectionError, match="needs true_error_fn"):
         choosing.check_policy("bavs")

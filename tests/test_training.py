@@ -19,6 +19,7 @@ from bavs_jax.training.batches import (
 )
 from bavs_jax.training.checkpoints import Checkpoints
 from bavs_jax.training.losses import colour_loss
+from bavs_jax.training.objectives import make_colour_objective
 from bavs_jax.training.train import init_train_state, make_optimiser, make_train_fn
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 from bavs_jax.uncertainty.streaming import make_curvature_fn, training_pixels
@@ -40,11 +41,10 @@ def trainer():
     train = make_train_fn(
         field,
         sampler,
+        make_colour_objective(field, background=scene.background, capacity=1024),
         optimiser,
         schedule,
-        background=scene.background,
         num_rays=64,
-        capacity=1024,
         steps_per_call=4,
     )
 

@@ -18,7 +18,8 @@ class Field(NamedTuple):
     """A radiance field as pure functions; nothing in it holds state.
 
     `init(key) -> params`
-    `apply(params, positions [K, 3], directions [K, 3], **inputs) -> (density [K], rgb [K, 3])`
+    `apply(params, positions [K, 3], directions [K, 3], **inputs) -> (density [K], rgb [K, 3])`,
+      and as a third a dict of whatever else the field says of each point, such as a variance
     `density(params, positions [K, 3], **inputs) -> density [K]`
     `penalty(params) -> []`, what training adds to the loss, times a weight
     `inputs(rays, samples [R, S], view_ids [R] or None) -> {name: [R, S, ...]}`, what more the

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from bavs_jax.fields.base import DensityField, Field, no_inputs
 from bavs_jax.fields.contraction import unit_coordinates
 from bavs_jax.fields.encodings import HashEncoding, level_resolutions, spherical_harmonics
-from bavs_jax.numerics import density_from_raw
+from bavs_jax.numerics import density_from_raw, point_variance
 
 
 class HashGridField(nn.Module):
@@ -22,6 +22,7 @@ class HashGridField(nn.Module):
       direction_degree: spherical-harmonics bands of the view direction.
       num_views: rows of the table of appearance codes.
       appearance_features: of each view's code; 0 for none.
+      learned_variance: whether the field also gives a variance of its colour.
     """
 
     resolutions: tuple[int, ...]
@@ -32,6 +33,7 @@ class HashGridField(nn.Module):
     direction_degree: int
     num_views: int = 0
     appearance_features: int = 0
+    learned_variance: bool = False
 
     def setup(self):
         self.encoding = HashEncoding(self.resolutions, self.features, self.log2_table_size)
@@ -39,6 +41,8 @@ class HashGridField(nn.Module):
         self.density_out = nn.Dense(1 + self.geometry_features)
         self.colour_hidden = [nn.Dense(self.width) for _ in range(2)]
         self.colour_out = nn.Dense(3)
+        if self.learned_variance:
+            self.variance_out = nn.Dense(1)
         if self.appearance_features:
             # 0 to begin with, and for good where a view is never trained on.
             shape = (self.num_views, self.appearance_features)
@@ -65,7 +69,12 @@ class HashGridField(nn.Module):
         hidden = jnp.concatenate(parts, axis=-1)
         for layer in self.colour_hidden:
             hidden = nn.relu(layer(hidden))
-        return density, nn.sigmoid(self.colour_out(hidden))
+        rgb = nn.sigmoid(self.colour_out(hidden))
+        if not self.learned_variance:
+            return density, rgb
+        # From the geometry's features alone: a point's variance has no direction (ActiveNeRF).
+        beta = point_variance(self.variance_out(features)[:, 0])
+        return density, rgb, {"beta": beta}
 
 
 def make_hash_grid_field(
@@ -82,6 +91,7 @@ def make_hash_grid_field(
     contracted: bool = False,
     num_views: int = 0,
     appearance_features: int = 0,
+    learned_variance: bool = False,
 ) -> Field:
     """Makes a hash-grid field over a box, or over contracted space around it.
 
@@ -97,6 +107,8 @@ def make_hash_grid_field(
       num_views: views of the scene; needed with appearance codes.
       appearance_features: of the code that each view trained on has for its exposure and white
         balance; 0 for none. Views that are not trained on are read with the mean code.
+      learned_variance: `apply` also returns `{"beta": [K]}`, `softplus(.) + 0.01`, the variance of
+        a point's colour (ActiveNeRF); trained by `make_variance_objective`.
 
     Returns:
       A `Field`.
@@ -111,6 +123,7 @@ def make_hash_grid_field(
         direction_degree=direction_degree,
         num_views=num_views,
         appearance_features=appearance_features,
+        learned_variance=learned_variance,
     )
 
     def to_unit(positions):

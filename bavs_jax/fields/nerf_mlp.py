@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from bavs_jax.fields.base import DensityField, Field, no_inputs
 from bavs_jax.fields.contraction import unit_coordinates
 from bavs_jax.fields.positional import cone_variance, integrated_encoding, positional_encoding
+from bavs_jax.numerics import point_variance
 
 
 class Trunk(nn.Module):
@@ -53,6 +54,7 @@ class NerfMlp(nn.Module):
     depth: int
     width: int
     skip: int
+    learned_variance: bool = False
 
     def setup(self):
         self.trunk = Trunk(self.depth, self.width, self.skip)
@@ -60,15 +62,20 @@ class NerfMlp(nn.Module):
         self.features = nn.Dense(self.width)
         self.colour_hidden = nn.Dense(self.width // 2)
         self.colour_out = nn.Dense(3)
+        if self.learned_variance:
+            self.variance_out = nn.Dense(1)
 
     def geometry(self, encoded):
         hidden = self.trunk(encoded)
         return raw_to_density(self.density_out(hidden)[:, 0]), hidden
 
     def __call__(self, encoded, encoded_directions):
-        density, hidden = self.geometry(encoded)
-        hidden = jnp.concatenate([self.features(hidden), encoded_directions], axis=-1)
-        return density, nn.sigmoid(self.colour_out(nn.relu(self.colour_hidden(hidden))))
+        density, trunk = self.geometry(encoded)
+        hidden = jnp.concatenate([self.features(trunk), encoded_directions], axis=-1)
+        rgb = nn.sigmoid(self.colour_out(nn.relu(self.colour_hidden(hidden))))
+        if not self.learned_variance:
+            return density, rgb
+        return density, rgb, {"beta": point_variance(self.variance_out(trunk)[:, 0])}
 
 
 class MlpDensity(nn.Module):
@@ -128,6 +135,7 @@ def make_nerf_mlp_field(
     direction_degree: int = 4,
     contracted: bool = False,
     pixel_radius: float | None = None,
+    learned_variance: bool = False,
 ) -> Field:
     """Makes a NeRF network over a box, or over contracted space around it.
 
@@ -137,6 +145,7 @@ def make_nerf_mlp_field(
       position_degree, direction_degree: octaves of the encodings, 10 and 4 in the paper.
       contracted: see `unit_coordinates`.
       pixel_radius: of a pixel's cone at distance 1, for the integrated encoding; None for points.
+      learned_variance: see `make_hash_grid_field`.
 
     Returns:
       A `Field`.
@@ -144,7 +153,7 @@ def make_nerf_mlp_field(
     encode, inputs = make_position_encoding(
         box, degree=position_degree, contracted=contracted, pixel_radius=pixel_radius
     )
-    module = NerfMlp(depth, width, skip)
+    module = NerfMlp(depth, width, skip, learned_variance)
 
     def init(key):
         point, direction = jnp.zeros((1, 3)), jnp.array([[0.0, 0.0, 1.0]])

@@ -66,6 +66,14 @@ def composite_colour(weights: jax.Array, rgb: jax.Array, background) -> jax.Arra
     return composite(weights, rgb, rgb[..., -1, :] if background is None else background)
 
 
+def rendered_variance(weights: jax.Array, variance: jax.Array) -> jax.Array:
+    """Variance of a ray's colour from independent ones of its samples: `sum_i w_i^2 beta_i`, [...].
+
+    0 on a ray that meets nothing.
+    """
+    return (jnp.square(weights) * variance).sum(-1)
+
+
 def expected_depth(weights: jax.Array, t_mids: jax.Array) -> jax.Array:
     """Mean distance of what is seen, `sum_i w_i t_i / sum_i w_i`, scene units; 0 on empty rays."""
     return safe_divide((weights * t_mids).sum(-1), weights.sum(-1))

@@ -29,6 +29,8 @@ class Rendering:
     opacity: jax.Array  # [R] in [0, 1]
     channels: dict[str, jax.Array]  # each [R]
     weights: jax.Array  # [R, S]
+    density: jax.Array  # [R, S] 1 / scene unit, 0 in empty slots
+    values: dict[str, jax.Array]  # what more the field returned at each sample, [R, S, ...]
     ray_mask: jax.Array  # [R] bool, false: the ray did not fit the buffer and must be left out
 
 
@@ -56,7 +58,8 @@ def render_rays(
     Args:
       rays: R rays.
       samples: [R, S] where to look.
-      field_fn: (positions [K, 3], directions [K, 3], **inputs) -> (density [K], rgb [K, 3]).
+      field_fn: (positions [K, 3], directions [K, 3], **inputs) -> (density [K], rgb [K, 3]), and
+        where the field has more to say of each point, a dict of that, [K, ...], as a third.
       background: [3] colour of what lies behind everything, or [R, 3]; None: see
         `composite_colour`.
       capacity: places of the buffer in which valid samples are evaluated.
@@ -82,9 +85,9 @@ def render_rays(
         positions = rays.origins[row] + t[:, None] * directions
         moved = positions if displace_fn is None else positions + displace_fn(positions)
         more = {name: x[place] for name, x in flat_inputs.items()}
-        density, rgb = field_fn(moved, directions, **more)
+        density, rgb, *values = field_fn(moved, directions, **more)
         extra = {name: channel.value_fn(positions) for name, channel in channels.items()}
-        return jnp.where(valid, density, 0.0), rgb, extra
+        return jnp.where(valid, density, 0.0), rgb, extra, values[0] if values else {}
 
     ray_mask = jnp.ones(num_rays, bool)
     if samples.dense:
@@ -94,7 +97,7 @@ def render_rays(
         outputs = evaluate_all_passes(evaluate, samples.sample_mask, capacity=capacity)
     else:
         outputs, ray_mask = evaluate_one_pass(evaluate, samples.sample_mask, capacity=capacity)
-    density, rgb, extra = outputs
+    density, rgb, extra, values = outputs
 
     weights = render_weights(density, samples.deltas)
     return Rendering(
@@ -106,5 +109,7 @@ def render_rays(
             for name, value in extra.items()
         },
         weights=weights,
+        density=density,
+        values=values,
         ray_mask=ray_mask,
     )

@@ -35,10 +35,12 @@ class Context:
     training_positions: jax.Array  # [V, 3] scene units
     is_training_view: jax.Array  # [V] bool
     centre: jax.Array  # [3] scene centre, scene units
-    # Eq 15: candidate indices int [n] -> mean uncertainty of each one's render, float [n].
+    # Eq 15: (candidates int [n], picked [C]) -> mean uncertainty of their renders, float [n].
     mean_uncertainty_fn: Callable | None = struct.field(pytree_node=False, default=None)
-    # `information.Information`: precision of the field now, curvature that each candidate adds.
+    # The posterior of the field and what each candidate would add to it (`information.py`).
     information: Any = struct.field(pytree_node=False, default=None)
+    # Candidate indices int [n] -> mean squared error of their renders against their photos [n].
+    true_error_fn: Callable | None = struct.field(pytree_node=False, default=None)
 
 
 def make_context(
@@ -51,6 +53,7 @@ def make_context(
     mask=None,
     mean_uncertainty_fn: Callable | None = None,
     information: Any = None,
+    true_error_fn: Callable | None = None,
 ) -> Context:
     """Checks and builds a `Context`, on the host.
 
@@ -61,8 +64,7 @@ def make_context(
       centre: [3] scene centre, scene units.
       view_ids: [C] distinct integers >= 0; default 0 .. C - 1.
       mask: [C] bool, which candidates may be picked; default all.
-      mean_uncertainty_fn: Eq 15 for given candidates, indices [n] -> [n].
-      information: `information.Information` of the field and the candidates.
+      mean_uncertainty_fn, information, true_error_fn: see `Context`.
 
     Returns:
       A `Context` with nothing picked yet.
@@ -100,6 +102,7 @@ def make_context(
         picked=np.zeros(num, bool),
         mean_uncertainty_fn=mean_uncertainty_fn,
         information=information,
+        true_error_fn=true_error_fn,
     )
 
 

@@ -27,7 +27,10 @@ class Policy(NamedTuple):
     summary: str  # one sentence
     score_fn: Callable[[jax.Array, Context], jax.Array]
     update_fn: Callable[[Context, int], Context] | None = None
-    needs: frozenset[str] = frozenset()  # what the caller must have made first: "curvature", ...
+    needs: frozenset[str] = frozenset()  # fields of `Context` that the caller must fill
+    uncertainty: str = "laplace"  # the model behind `mean_uncertainty_fn` (uncertainty/models)
+    measure: str = "uncertainty"  # which of the model's images its mean is taken of
+    field_kind: str = "reconstruction"  # of the field that the run itself trains and is measured on
     mode: Mode = "top_k"  # default way to a batch: the k largest at once, or one after another
     distance_filter: bool = False  # whether the max-min distance filter (Fig 5) goes first
     stochastic: bool = False  # whether scores depend on the key

@@ -12,7 +12,6 @@ import optax
 from flax import struct
 
 from bavs_jax.fields.base import Field
-from bavs_jax.rendering.render import render_rays
 from bavs_jax.rendering.samplers import Sampler
 from bavs_jax.training.batches import sample_pixels
 from bavs_jax.training.losses import colour_loss
@@ -66,12 +65,11 @@ def init_train_state(key, field: Field, sampler: Sampler, optimiser) -> TrainSta
 def make_train_fn(
     field: Field,
     sampler: Sampler,
+    objective: Callable,
     optimiser,
     schedule: Callable,
     *,
-    background,
     num_rays: int,
-    capacity: int,
     penalty_weight: float = 0.0,
     steps_per_call: int = 16,
 ) -> Callable:
@@ -80,10 +78,9 @@ def make_train_fn(
     Args:
       field: the radiance field.
       sampler: how rays are sampled; its parameters are trained along.
+      objective: what the field is trained for, from `objectives.py`.
       optimiser, schedule: from `make_optimiser`.
-      background: [3] colour behind everything, or None (see `composite_colour`).
       num_rays: R, rays of one step.
-      capacity: places of the buffer for valid samples; a dense sampler needs none.
       penalty_weight: of the field's own penalty.
       steps_per_call: optimiser steps compiled together.
 
@@ -91,32 +88,23 @@ def make_train_fn(
       `train(key, state, table, is_training_view) -> (state, TrainInfo)`: `steps_per_call` steps in
       one jitted call. Views are a mask, so adding views compiles nothing anew. `state` is donated.
     """
-    background = None if background is None else jnp.asarray(background, jnp.float32)
 
     def loss_fn(params, key, sampler_state, table, is_training_view):
-        pixel_key, sample_key = jax.random.split(key)
+        pixel_key, sample_key, objective_key = jax.random.split(key, 3)
         batch = sample_pixels(pixel_key, table, is_training_view, num_rays)
         samples, aux = sampler.sample(sample_key, params["sampler"], sampler_state, batch.rays)
-        rendering = render_rays(
-            batch.rays,
-            samples,
-            partial(field.apply, params["field"]),
-            background=background,
-            capacity=capacity,
-            exact=False,
-            inputs=field.inputs(batch.rays, samples, batch.view_ids),
-        )
-        ray_weight = batch.ray_weight * rendering.ray_mask
+        outcome = objective(objective_key, params["field"], batch, samples)
+        ray_weight = batch.ray_weight * outcome.ray_mask
         colour_loss_fn = partial(colour_loss, target=batch.rgb, ray_weight=ray_weight)
-        loss = colour_loss_fn(rendering.rgb)
-        sampler_loss = sampler.loss(aux, samples, rendering.weights, colour_loss_fn)
+        sampler_loss = sampler.loss(aux, samples, outcome.weights, colour_loss_fn)
         report = {
-            "rays": rendering.ray_mask.sum(),
-            "samples": (samples.sample_mask & rendering.ray_mask[:, None]).sum(),
+            "loss": colour_loss_fn(outcome.rgb),
+            "rays": outcome.ray_mask.sum(),
+            "samples": (samples.sample_mask & outcome.ray_mask[:, None]).sum(),
             "thinned": samples.thinned.mean(),
         }
-        total = loss + sampler_loss + penalty_weight * field.penalty(params["field"])
-        return total, {"loss": loss, **report}
+        penalty = penalty_weight * field.penalty(params["field"])
+        return outcome.loss + sampler_loss + penalty, report
 
     def one_step(state, key, table, is_training_view):
         (_, report), grads = jax.value_and_grad(loss_fn, has_aux=True)(

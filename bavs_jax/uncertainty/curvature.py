@@ -50,7 +50,8 @@ def colour_jacobian(
 
     def ray_colour(offsets, origin, direction, t_mids, deltas, more):
         positions = origin + t_mids[:, None] * direction + offsets
-        density, rgb = field_fn(positions, jnp.broadcast_to(direction, positions.shape), **more)
+        directions = jnp.broadcast_to(direction, positions.shape)
+        density, rgb, *_ = field_fn(positions, directions, **more)
         colour = composite_colour(render_weights(density, deltas), rgb, background)
         return colour, colour
 
@@ -77,7 +78,7 @@ def split_colour_jacobian(
     flat_inputs = flatten_inputs(inputs or {})
 
     def field_at(flat_positions):
-        return field_fn(flat_positions, flat_directions, **flat_inputs)
+        return field_fn(flat_positions, flat_directions, **flat_inputs)[:2]
 
     def along(axis):
         tangent = jnp.broadcast_to(axis, flat_directions.shape)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import numpy as np
@@ -12,7 +11,7 @@ from bavs_jax.cameras import Cameras, rescale
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.rendering.images import render_views
-from bavs_jax.rendering.render import render_rays
+from bavs_jax.rendering.pixels import basic_images, render_pixels
 from bavs_jax.rendering.samplers import Sampler
 from bavs_jax.uncertainty.channel import finish_uncertainty, make_uncertainty_channel
 
@@ -36,32 +35,25 @@ def make_render_chunk_fn(
 
     @jax.jit
     def render_chunk(params, sampler_state, variance, rays):
-        samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
         channels = {}
         if variance is not None:
             channels["uncertainty"] = make_uncertainty_channel(
                 grid, variance, variant=variant, scale=scale
             )
-        rendering = render_rays(
+        rendering, samples = render_pixels(
+            field,
+            sampler,
+            params,
+            sampler_state,
             rays,
-            samples,
-            partial(field.apply, params["field"]),
             background=background,
             capacity=capacity,
-            exact=True,
-            inputs=field.inputs(rays, samples),
             channels=channels,
         )
-        return {
-            "rgb": rendering.rgb,
-            "depth": rendering.depth,
-            "opacity": rendering.opacity,
-            "thinned": samples.thinned,
-            **{
-                name: finish_uncertainty(value, scale=scale)
-                for name, value in rendering.channels.items()
-            },
-        }
+        images = basic_images(rendering, samples)
+        for name, value in rendering.channels.items():
+            images[name] = finish_uncertainty(value, scale=scale)
+        return images
 
     return render_chunk
 
@@ -72,23 +64,26 @@ def reduced_cameras(cameras: Cameras, image_scale: float) -> Cameras:
     return rescale(cameras, sizes)
 
 
-def mean_uncertainty(chunk_fn: Callable, cameras: Cameras, *, chunk, progress_fn=None):
+def mean_uncertainty(
+    chunk_fn: Callable, cameras: Cameras, *, chunk, measure="uncertainty", progress_fn=None
+):
     """Score of candidates, `f = |U|_1 / (W H)` over the pixels of each one's image (Eq 15).
 
     Args:
-      chunk_fn: `Rays` [chunk] -> dict with "uncertainty" [chunk], >= 0.
+      chunk_fn: `Rays` [chunk] -> dict with `measure` [chunk], >= 0.
       cameras: n candidates, mostly of a reduced size (`reduced_cameras`).
       chunk: rays of one compiled call.
+      measure: which image's mean is taken.
       progress_fn: called with the number of rays done since the last call.
 
     Returns:
       [n] float32 in the unit of the channel.
     """
     images = render_views(
-        lambda rays: {"uncertainty": chunk_fn(rays)["uncertainty"]},
+        lambda rays: {measure: chunk_fn(rays)[measure]},
         cameras,
         np.arange(len(cameras)),
         chunk=chunk,
         progress_fn=progress_fn,
     )
-    return np.array([image["uncertainty"].mean() for image in images], np.float32)
+    return np.array([image[measure].mean() for image in images], np.float32)

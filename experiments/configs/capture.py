@@ -17,5 +17,5 @@ def get_config():
     config.num_rounds = 0
     config.field.finest = 512
     config.field.appearance_features = 4
-    config.train.num_steps = 2400
+    config.train.num_steps = 4000
     return config

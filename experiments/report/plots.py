@@ -23,6 +23,7 @@ POLICY_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 PARTS = {
     "train": ("training", BLUE),
     "curvature": ("curvature", ORANGE),
+    "fit": ("training other fields", VERMILION),
     "score": ("scoring candidates", GREEN),
     "select": ("selecting", PURPLE),
     "evaluate": ("measuring on test views", SKY),

@@ -19,7 +19,7 @@ from bavs_jax.uncertainty.scoring import mean_uncertainty, reduced_cameras
 from experiments.build import RENDER_CHUNK, Problem
 from experiments.progress import track
 
-SUPPORTED_NEEDS = {"curvature"}
+SUPPORTED_NEEDS = {"mean_uncertainty_fn"}
 
 
 class Suggestion(NamedTuple):
@@ -33,10 +33,13 @@ class Suggestion(NamedTuple):
 
 def check_policy(name: str) -> None:
     """Raises SelectionError for a policy that is unknown or needs more than a curvature."""
-    more = get_policy(name).needs - SUPPORTED_NEEDS
+    policy = get_policy(name)
+    more = sorted(policy.needs - SUPPORTED_NEEDS)
+    if policy.uncertainty != "laplace":
+        more.append(policy.uncertainty)
     if more:
         raise SelectionError(
-            f"--policy: {name!r} needs {', '.join(sorted(more))}, which one field has not; "
+            f"--policy: {name!r} needs {', '.join(more)}, which one field has not; "
             "use another policy, such as bavs"
         )
 
@@ -124,7 +127,7 @@ def suggest(
         training_positions=np.asarray(scene.cameras.positions),
         is_training_view=is_training,
         centre=centre,
-        mean_uncertainty_fn=lambda indices: scores[indices],
+        mean_uncertainty_fn=lambda indices, picked: scores[indices],
     )
     key = jax.random.fold_in(jax.random.key(seed), 1)
     selected, info = acquire(get_policy(policy), key, context, num_views)

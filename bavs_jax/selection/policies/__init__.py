@@ -7,25 +7,18 @@ line, the sweep, the report and the battery of tests then know it.
 from __future__ import annotations
 
 import difflib
-import importlib
-import pkgutil
 
+from bavs_jax.registry import collect
 from bavs_jax.selection.context import SelectionError
 from bavs_jax.selection.policy import Policy
 
 
 def collect_policies() -> dict[str, Policy]:
     """Imports every module of this package; raises SelectionError at one without its POLICY."""
-    table = {}
-    for module_info in pkgutil.iter_modules(__path__):
-        name = module_info.name
-        policy = getattr(importlib.import_module(f"{__name__}.{name}"), "POLICY", None)
-        if policy is None or policy.name != name:
-            raise SelectionError(
-                f"policies/{name}.py: must hold POLICY = Policy(name={name!r}, ...)"
-            )
-        table[name] = policy
-    return table
+    try:
+        return collect(__name__, __path__, "POLICY", "Policy")
+    except ValueError as error:
+        raise SelectionError(str(error)) from error
 
 
 POLICIES: dict[str, Policy] = collect_policies()

@@ -7,12 +7,13 @@ from bavs_jax.selection.policy import Policy
 def score(key, ctx):
     """Mean over the pixels of each candidate's rendered uncertainty (Eq 15)."""
     del key
-    return score_candidates(ctx, require(ctx, "mean_uncertainty_fn"))
+    mean_uncertainty = require(ctx, "mean_uncertainty_fn")
+    return score_candidates(ctx, lambda indices: mean_uncertainty(indices, ctx.picked))
 
 
 POLICY = Policy(
     name="bavs_topk",
     summary="The k candidates of largest mean rendered uncertainty (Eq 15), no distance filter.",
     score_fn=score,
-    needs=frozenset({"curvature"}),
+    needs=frozenset({"mean_uncertainty_fn"}),
 )

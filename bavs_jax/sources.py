@@ -1,0 +1,163 @@
+"""Where a policy's numbers come from: fills a selection's `Context` with what the policy needs."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from bavs_jax.cameras import take
+from bavs_jax.candidates import Candidates
+from bavs_jax.selection.information import Information, make_cached_curvature_fn
+from bavs_jax.selection.policy import Policy
+from bavs_jax.uncertainty.model import ModelFns, Situation, Toolbox
+from bavs_jax.uncertainty.models.laplace import training_curvature
+from bavs_jax.uncertainty.posterior import posterior_precision
+from bavs_jax.uncertainty.scoring import mean_uncertainty, reduced_cameras
+
+WEIGHTING = "eq13"  # of candidates: the only one that needs no photo
+
+
+class SourceOptions(NamedTuple):
+    """How candidates are looked at."""
+
+    image_scale: float  # of width and height, for the score (Eq 15)
+    chunk: int  # rays of one compiled call
+    cache_bytes: int = 2**30  # most memory for curvatures of candidates; the others are made anew
+
+
+class Sources(NamedTuple):
+    """What a policy may ask for."""
+
+    fields: dict  # of `Context`
+    seconds: dict[str, float]  # spent so far on "curvature", "fit" and "score"
+
+
+def make_sources_fn(
+    toolbox: Toolbox,
+    models: Mapping[str, Callable],
+    options: SourceOptions,
+    *,
+    track: Callable,
+    true_error_fn: Callable | None = None,
+) -> Callable:
+    """Makes `sources(policy, key, situation, candidates) -> Sources`.
+
+    Args:
+      toolbox: the parts of a scene.
+      models: name -> `() -> ModelFns`, made when first asked for.
+      options: how candidates are looked at.
+      track: (total, label, unit) -> a context with `advance(n)`, for progress.
+      true_error_fn: (train_state, view_ids [n]) -> mean squared colour error [n] of renders against
+        the photos themselves; None where candidates have none.
+    """
+
+    def make_mean_fn(policy, key, situation, candidates, seconds):
+        fns: ModelFns = models[policy.uncertainty]()
+        stage = "fit" if policy.uncertainty != "laplace" else "curvature"
+        with _clock(seconds, stage):
+            fitted = fns.fit(key, situation)
+
+        def mean_fn(indices, picked):
+            with _clock(seconds, "score"):
+                known = fitted
+                if fns.condition is not None:
+                    known = fns.condition(fitted, candidates.cameras, picked)
+                small = reduced_cameras(take(candidates.cameras, indices), options.image_scale)
+                num_rays = _count_rays(small)
+                label = f"{situation.label}: score {len(indices)} views"
+                with track(num_rays, label, "rays") as bar:
+                    return mean_uncertainty(
+                        lambda rays: fns.render(known, situation.train, rays),
+                        small,
+                        measure=policy.measure,
+                        chunk=options.chunk,
+                        progress_fn=bar.advance,
+                    )
+
+        return mean_fn
+
+    def make_information(key, situation, candidates, seconds):
+        with _clock(seconds, "curvature"):
+            jac_sq_sum = training_curvature(key, toolbox, situation, WEIGHTING)
+            precision = posterior_precision(
+                jac_sq_sum,
+                num_rays=situation.num_rays,
+                prior_weight=toolbox.laplace.prior_weight,
+                weighting=WEIGHTING,
+            )
+        dense = make_candidate_curvature_fn(toolbox, situation, candidates, options.image_scale)
+
+        def timed(index):
+            with _clock(seconds, "score"):
+                return dense(index)
+
+        curvature_fn = make_cached_curvature_fn(
+            timed, num_vertices=toolbox.grid.num_vertices, max_bytes=options.cache_bytes
+        )
+        return Information(precision, curvature_fn)
+
+    def sources(policy: Policy, key, situation: Situation, candidates: Candidates) -> Sources:
+        seconds = dict.fromkeys(("curvature", "fit", "score"), 0.0)
+        makers = {
+            "mean_uncertainty_fn": lambda: make_mean_fn(
+                policy, key, situation, candidates, seconds
+            ),
+            "information": lambda: make_information(key, situation, candidates, seconds),
+        }
+        if true_error_fn is not None:
+            makers["true_error_fn"] = lambda: (
+                lambda indices: true_error_fn(situation.train, candidates.view_ids[indices])
+            )
+        # What is missing here is refused by name when the policy asks for it.
+        return Sources({n: makers[n]() for n in sorted(policy.needs) if n in makers}, seconds)
+
+    return sources
+
+
+def make_candidate_curvature_fn(
+    toolbox: Toolbox, situation: Situation, candidates: Candidates, image_scale: float
+) -> Callable:
+    """Makes `curvature(index) -> [G, 3]`: what a candidate's photo would add to the precision.
+
+    Eq 13 knows no colours, so a pose is enough. The sum runs over the pixels of a reduced image and
+    is scaled up to the pixels that the photo would have; it is in the unit of the posterior's
+    precision, `(2 / R) jac_sq_sum` with the run's own R.
+    """
+    small = reduced_cameras(candidates.cameras, image_scale)
+    whole_rays = np.prod(np.asarray(candidates.cameras.sizes), axis=-1)
+    small_rays = np.prod(np.asarray(small.sizes), axis=-1)
+    table = situation.table
+
+    def curvature(index):
+        # The candidate stands in for view 0, so that all arrays keep the table's shapes and nothing
+        # is compiled anew; its pixels are not looked at.
+        stand_in = jax.tree.map(lambda x, y: x.at[0].set(y[index]), table.cameras, small)
+        num = int(small_rays[index])
+        added = toolbox.curvature(
+            situation.train,
+            table.replace(cameras=stand_in),
+            np.zeros(num, np.int32),
+            np.arange(num, dtype=np.int32),
+            None,
+            weighting=WEIGHTING,
+        )
+        return 2.0 / situation.num_rays * float(whole_rays[index]) / num * added
+
+    return curvature
+
+
+def _count_rays(cameras) -> int:
+    return int(np.prod(np.asarray(cameras.sizes), axis=-1).sum())
+
+
+@contextlib.contextmanager
+def _clock(seconds: dict[str, float], name: str):
+    """Adds the time of a block to one entry of a table."""
+    start = time.perf_counter()
+    yield
+    seconds[name] += time.perf_counter() - start

@@ -1,0 +1,96 @@
+"""What a field is trained for: from a batch of rays and samples to a loss.
+
+`objective(key, params, batch, samples) -> Outcome` is a pure function of a field's parameters. The
+samples' own losses and the field's penalty are added by `train.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from bavs_jax.fields.base import Field
+from bavs_jax.numerics import MIN_VARIANCE
+from bavs_jax.rendering.compositing import rendered_variance
+from bavs_jax.rendering.render import Rendering, render_rays
+from bavs_jax.training.batches import PixelBatch
+from bavs_jax.training.losses import colour_loss, gaussian_nll, weighted_mean
+
+
+class Outcome(NamedTuple):
+    """What an objective found."""
+
+    loss: jax.Array  # [] what is made small
+    rgb: jax.Array  # [R, 3] the rendered colours, for the report
+    weights: jax.Array  # [R, S] rendering weights, for the losses of samplers
+    ray_mask: jax.Array  # [R] bool, false for rays that did not fit the sample buffer
+
+
+def _render_batch(field: Field, background, capacity: int) -> Callable:
+    def render(params, batch: PixelBatch, samples) -> Rendering:
+        return render_rays(
+            batch.rays,
+            samples,
+            partial(field.apply, params),
+            background=background,
+            capacity=capacity,
+            exact=False,
+            inputs=field.inputs(batch.rays, samples, batch.view_ids),
+        )
+
+    return render
+
+
+def make_colour_objective(field: Field, *, background, capacity: int) -> Callable:
+    """Mean squared colour error (Eq 5).
+
+    Args:
+      field: the radiance field.
+      background: [3] colour behind everything, or None (see `composite_colour`).
+      capacity: places of the buffer for valid samples; a dense sampler needs none.
+    """
+    render = _render_batch(field, background, capacity)
+
+    def objective(key, params, batch, samples):
+        del key
+        out = render(params, batch, samples)
+        loss = colour_loss(out.rgb, batch.rgb, batch.ray_weight * out.ray_mask)
+        return Outcome(loss, out.rgb, out.weights, out.ray_mask)
+
+    return objective
+
+
+def make_variance_objective(
+    field: Field, *, background, capacity: int, density_weight: float = 0.01
+) -> Callable:
+    """Likelihood of the colours under the rendered variance (ActiveNeRF, Pan et al. 2022).
+
+    `mean_rc (C - C*)^2 / (2 U) + mean_r log(U) / 2 + density_weight mean_i sigma_i`, with
+    `U = sum_i w_i^2 beta_i + (1 - sum_i w_i)^2 0.01` of the field's `beta`.
+
+    Differs from ActiveNeRF: the background counts as one more sample, of the least variance a
+    sample can have. Without it U vanishes on rays that meet nothing, and they outweigh all others.
+
+    Args:
+      field: one whose `apply` also returns `beta`.
+      background, capacity: see `make_colour_objective`.
+      density_weight: of the mean density, which keeps empty space empty.
+    """
+    render = _render_batch(field, background, capacity)
+
+    def objective(key, params, batch, samples):
+        del key
+        out = render(params, batch, samples)
+        ray_weight = batch.ray_weight * out.ray_mask
+        variance = rendered_variance(out.weights, out.values["beta"])
+        variance = variance + jnp.square(1.0 - out.opacity) * MIN_VARIANCE
+        loss = gaussian_nll(out.rgb, batch.rgb, variance, ray_weight)
+        kept = samples.sample_mask & out.ray_mask[:, None]
+        density = weighted_mean(out.density, kept)
+        return Outcome(loss + density_weight * density, out.rgb, out.weights, out.ray_mask)
+
+    return objective

@@ -1,0 +1,73 @@
+"""From a config to the scene, the views a run starts with and the candidates."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from bavs_jax.candidates import (
+    CandidateSource,
+    captured_candidates,
+    dataset_candidates,
+    with_empty_views,
+)
+from bavs_jax.scenes import Scene, SceneError, load_scene
+from bavs_jax.scenes.procedural import capture
+from bavs_jax.training.batches import PixelTable
+
+
+def load_config_scene(config, *, cache_dir: str | None) -> Scene:
+    """The scene that a config names, from its `data_dir` or from $BAVS_DATA.
+
+    Raises:
+      SceneError: neither is given, or the scene's files cannot be used.
+    """
+    if config.loader == "procedural":
+        return load_scene("procedural", image_size=config.image_size, cache_dir=cache_dir)
+    folder = config.data_dir
+    if not folder:
+        if not os.environ.get("BAVS_DATA"):
+            raise SceneError(
+                "config.data_dir: is empty and BAVS_DATA is not set: "
+                "pass --config.data_dir=FOLDER_OF_SCENES"
+            )
+        folder = os.path.join(os.environ["BAVS_DATA"], config.loader)
+    root = os.path.join(folder, config.scene)
+    options = {name: value for name, value in config.load.items() if value}
+    if options.get("pool_size", 0.0) >= 1:
+        options["pool_size"] = int(options["pool_size"])
+    return load_scene(config.loader, root=root, image_size=config.image_size, **options)
+
+
+def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:
+    """Which views a run starts with: a function of seed and scene alone, never of the policy.
+
+    A `num` of 0 takes all of the pool.
+    """
+    num = num or len(scene.pool)
+    if not 1 <= num <= len(scene.pool):
+        raise SceneError(
+            f"{scene.name}: num_initial is {num}, but the pool has {len(scene.pool)} views: "
+            "give a number between 1 and that"
+        )
+    return np.random.default_rng(seed).permutation(np.asarray(scene.pool))[:num]
+
+
+def make_source(config, scene: Scene, table: PixelTable) -> tuple[CandidateSource, PixelTable]:
+    """Where candidates come from, and the table with room for pictures taken on the way."""
+    options = config.candidates
+    if options.source == "dataset":
+        return dataset_candidates(scene), table
+    draws = options.hemisphere_draws
+    if config.loader != "procedural":
+        return dataset_candidates(scene, hemisphere_draws=draws), table
+    first_slot = len(table.cameras)
+    table = with_empty_views(table, config.num_rounds * config.batch_size)
+    source = captured_candidates(
+        scene,
+        lambda cameras: capture(cameras)[0],
+        num_candidates=draws,
+        first_slot=first_slot,
+    )
+    return source, table

@@ -1,0 +1,93 @@
+"""From a config to everything that trains one kind of field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from bavs_jax.fields.base import Field
+from bavs_jax.rendering.samplers import Sampler
+from bavs_jax.scenes import Scene
+from bavs_jax.training.objectives import make_colour_objective, make_variance_objective
+from bavs_jax.training.train import TrainState, init_train_state, make_optimiser, make_train_fn
+from bavs_jax.uncertainty.model import RECONSTRUCTION, VARIANCE, Situation
+from experiments.build_field import build_field, field_background, learning_rate
+
+
+class Trainer(NamedTuple):
+    """One kind of field with its training."""
+
+    field: Field
+    sampler: Sampler
+    init: Callable  # key -> TrainState
+    call: Callable  # see `make_train_fn`
+
+
+OBJECTIVES = {RECONSTRUCTION: make_colour_objective, VARIANCE: make_variance_objective}
+
+
+def build_trainer(config, scene: Scene, num_views: int, kind: str) -> Trainer:
+    """Puts a field, its sampler, its objective and its optimiser together; compiles nothing yet.
+
+    Args:
+      config: see `experiments/configs/base.py`.
+      scene: the scene.
+      num_views: views of the pixel table.
+      kind: a key of `OBJECTIVES`.
+    """
+    field, sampler = build_field(config, scene, num_views, learned_variance=kind == VARIANCE)
+    train = config.train
+    optimiser, schedule = make_optimiser(
+        learning_rate=learning_rate(config),
+        final_share=train.final_share,
+        num_steps=train.num_steps,
+    )
+    call = make_train_fn(
+        field,
+        sampler,
+        OBJECTIVES[kind](field, background=field_background(scene), capacity=train.capacity),
+        optimiser,
+        schedule,
+        num_rays=train.num_rays,
+        penalty_weight=train.penalty_weight,
+        steps_per_call=train.steps_per_call,
+    )
+    init = jax.jit(partial(init_train_state, field=field, sampler=sampler, optimiser=optimiser))
+    return Trainer(field, sampler, init, call)
+
+
+def calls_per_round(config) -> int:
+    """Compiled training calls of a round."""
+    return -(-config.train.num_steps // config.train.steps_per_call)
+
+
+def train_aside(
+    config, trainer: Trainer, key, situation: Situation, kind: str, track
+) -> TrainState:
+    """Trains a field beside the run's own, on the same views for as many steps.
+
+    Raises:
+      FloatingPointError: the loss is not finite.
+    """
+    init_key, steps_key = jax.random.split(key)
+    state = trainer.init(init_key)
+    num_calls, steps = calls_per_round(config), config.train.steps_per_call
+    with track(num_calls * steps, f"{situation.label}: train {kind}", "steps") as bar:
+        for number in range(num_calls):
+            state, info = trainer.call(
+                jax.random.fold_in(steps_key, number),
+                state,
+                situation.table,
+                situation.is_training_view,
+            )
+            if not np.isfinite(info.loss):
+                raise FloatingPointError(
+                    f"{kind} field, training call {number}: the loss is {float(info.loss)}; "
+                    "try a smaller learning rate"
+                )
+            bar.advance(steps, loss=float(info.loss))
+    return state
