@@ -117,7 +117,11 @@ def make_active_step(
     def choose(key, state):
         propose_key, source_key, policy_key = jax.random.split(key, 3)
         candidates = source.propose(propose_key, state.table, state.is_training_view)
-        situation = Situation(state.train, state.table, state.is_training_view, num_rays, label)
+        situation = Situation(
+            *(state.train, state.table, state.is_training_view, num_rays),
+            candidates=candidates.cameras,
+            label=label,
+        )
         start = time.perf_counter()
         sources = stages.sources(policy, source_key, situation, candidates)
         context = make_context(

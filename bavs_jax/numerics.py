@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 MAX_LOG_DENSITY = 12.0
 MIN_VARIANCE = 0.01  # of a point's colour, where a field learns one
+MIN_OPACITY = 1e-6  # what is relative to a ray's opacity is 0 below it, or gradients overflow
 
 
 @jax.custom_jvp
@@ -35,6 +36,24 @@ def safe_divide(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
     """`numerator / denominator`, and 0 with gradient 0 where the denominator is 0."""
     is_zero = denominator == 0
     return jnp.where(is_zero, 0.0, numerator / jnp.where(is_zero, 1.0, denominator))
+
+
+def opacity_or_empty(weights: jax.Array) -> jax.Array:
+    """Opacity `sum_i w_i` of rays [..., S], and 0 with gradient 0 where it is below 1e-6: [...].
+
+    To divide by with `safe_divide`, whose gradient would overflow at smaller opacities.
+    """
+    opacity = weights.sum(-1)
+    return jnp.where(opacity < MIN_OPACITY, 0.0, opacity)
+
+
+def x_log_x(x: jax.Array) -> jax.Array:
+    """`x log x` for x >= 0, and 0 with gradient 0 where x is 0, in nats.
+
+    Numerics: a positive number too small for a normal float counts as 0.
+    """
+    is_zero = x < jnp.finfo(x.dtype).tiny
+    return jnp.where(is_zero, 0.0, x * jnp.log(jnp.where(is_zero, 1.0, x)))
 
 
 def safe_reciprocal(x: jax.Array) -> jax.Array:

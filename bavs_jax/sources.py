@@ -66,7 +66,7 @@ def make_sources_fn(
             with _clock(seconds, "score"):
                 known = fitted
                 if fns.condition is not None:
-                    known = fns.condition(fitted, candidates.cameras, picked)
+                    known = fns.condition(fitted, situation.train, picked)
                 small = reduced_cameras(take(candidates.cameras, indices), options.image_scale)
                 num_rays = _count_rays(small)
                 label = f"{situation.label}: score {len(indices)} views"

@@ -162,6 +162,9 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
             laplace=laplace,
             curvature=tracked_curvature,
             train=train,
+            image_scale=config.candidates.image_scale,
+            chunk=RENDER_CHUNK,
+            ensemble_size=config.uncertainty.ensemble_size,
         )
 
     @cache

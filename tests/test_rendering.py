@@ -247,7 +247,7 @@ def test_channels_are_composited_over_their_floor():
     empty_ray = Rays(jnp.array([[5.0, 5.0, 5.0]]), jnp.array([[1.0, 0.0, 0.0]]))
     rays = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), rays, empty_ray)
     samples = march(rays, init_occupancy(BOX, resolution=4), options())
-    channel = Channel(lambda x: jnp.full(len(x), 2.0), floor=-3.0)
+    channel = Channel(lambda x, _: jnp.full(len(x), 2.0), floor=-3.0)
     got = render(rays, samples, channels={"two": channel})
     want = 2.0 * got.opacity - 3.0 * (1.0 - got.opacity)
     np.testing.assert_allclose(got.channels["two"], want, atol=1e-5)

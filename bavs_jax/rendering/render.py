@@ -37,7 +37,7 @@ class Rendering:
 class Channel(NamedTuple):
     """One more quantity to composite like colour: `sum_i w_i value_i + (1 - sum_i w_i) floor`."""
 
-    value_fn: Callable  # positions [K, 3] -> [K]
+    value_fn: Callable  # (positions [K, 3], directions [K, 3]) -> [K]
     floor: float = 0.0  # what a ray sees that meets nothing
 
 
@@ -86,7 +86,9 @@ def render_rays(
         moved = positions if displace_fn is None else positions + displace_fn(positions)
         more = {name: x[place] for name, x in flat_inputs.items()}
         density, rgb, *values = field_fn(moved, directions, **more)
-        extra = {name: channel.value_fn(positions) for name, channel in channels.items()}
+        extra = {
+            name: channel.value_fn(positions, directions) for name, channel in channels.items()
+        }
         return jnp.where(valid, density, 0.0), rgb, extra, values[0] if values else {}
 
     ray_mask = jnp.ones(num_rays, bool)

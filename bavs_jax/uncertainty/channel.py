@@ -68,10 +68,10 @@ def make_uncertainty_channel(
       ValueError: unknown scale.
     """
     if scale == "sigma":
-        return Channel(lambda x: uncertainty_at(grid, variance, x, variant=variant), 0.0)
+        return Channel(lambda x, _: uncertainty_at(grid, variance, x, variant=variant), 0.0)
     if scale == "log":
         return Channel(
-            lambda x: jnp.log10(uncertainty_at(grid, variance, x, variant=variant)), LOG10_MIN
+            lambda x, _: jnp.log10(uncertainty_at(grid, variance, x, variant=variant)), LOG10_MIN
         )
     raise ValueError(f"scale: {scale!r} is unknown; use one of {', '.join(SCALES)}")
 

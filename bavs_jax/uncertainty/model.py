@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 
+from bavs_jax.cameras import Cameras
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.rendering.samplers import Sampler
@@ -39,8 +40,8 @@ class ModelFns(NamedTuple):
     `render(fitted, train_state, rays [R]) -> images`: a dict of [R, ...] with "rgb", "depth",
       "opacity", "thinned" and "uncertainty" >= 0; and by the names that policies ask for, further
       measures that are made on the way.
-    `condition(fitted, cameras, picked [C]) -> fitted`: what is still unknown once the candidates
-      that are marked have been photographed; None where a model cannot tell without the photo.
+    `condition(fitted, train_state, picked [C]) -> fitted`: what is still unknown once the
+      candidates that are marked are photographed too; None where a model needs the photo for that.
     """
 
     fit: Callable[..., Any]
@@ -75,6 +76,9 @@ class Toolbox(NamedTuple):
     laplace: LaplaceOptions
     curvature: Callable
     train: Callable
+    image_scale: float = 0.25  # of width and height, for renders of whole views
+    chunk: int = 4096  # rays of one compiled call
+    ensemble_size: int = 3  # fields, the run's own among them
 
 
 class Situation(NamedTuple):
@@ -84,4 +88,5 @@ class Situation(NamedTuple):
     table: PixelTable
     is_training_view: Any  # [V] bool
     num_rays: int  # R of Eq 13: the training rays of round 0, fixed for the run
+    candidates: Cameras | None = None  # [C]
     label: str = ""  # for progress

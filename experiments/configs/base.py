@@ -111,6 +111,7 @@ def get_config() -> ConfigDict:
     config.uncertainty.weighting = "eq13"  # "eq13", "eq11" or "empirical"
     config.uncertainty.variant = "posterior"  # "posterior" or "bayesrays"
     config.uncertainty.scale = "log"  # "log": log10 sigma on [0, 1]; "sigma"
+    config.uncertainty.ensemble_size = 3  # fields, the run's own among them
     config.uncertainty.max_rays = 0  # training rays in the curvature; 0: all
 
     # --- candidates (bavs_jax/candidates.py, bavs_jax/selection) ---

@@ -1,0 +1,25 @@
+"""Ray entropy (Lee et al. 2022): where along the ray is the surface?"""
+
+from __future__ import annotations
+
+from bavs_jax.uncertainty.entropy import ray_entropy
+from bavs_jax.uncertainty.images import make_image_fn
+from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
+
+
+def make_fns(toolbox: Toolbox) -> ModelFns:
+    """Read off the rendering weights: nothing is fitted."""
+    images = make_image_fn(
+        toolbox, toolbox.kind, lambda out: {"uncertainty": ray_entropy(out.weights)}
+    )
+    return ModelFns(
+        fit=lambda key, situation: None,
+        render=lambda fitted, train, rays: images(train, rays),
+    )
+
+
+MODEL = UncertaintyModel(
+    name="entropy",
+    summary="Entropy of where each ray ends, times its opacity.",
+    make_fns=make_fns,
+)

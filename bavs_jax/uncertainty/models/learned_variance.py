@@ -1,0 +1,41 @@
+"""ActiveNeRF (Pan et al. 2022): a variance of colour that is trained with the field."""
+
+from __future__ import annotations
+
+from bavs_jax.rendering.compositing import rendered_variance
+from bavs_jax.uncertainty.active_gain import variance_reduction
+from bavs_jax.uncertainty.images import make_image_fn
+from bavs_jax.uncertainty.model import VARIANCE, ModelFns, Toolbox, UncertaintyModel
+
+
+def _measures(rendering) -> dict:
+    beta = rendering.values["beta"]
+    return {
+        "uncertainty": rendered_variance(rendering.weights, beta),
+        "gain": variance_reduction(rendering.weights, beta),
+    }
+
+
+def make_fns(toolbox: Toolbox) -> ModelFns:
+    """A run whose own field has the variance needs no other; else one is trained beside it.
+
+    "gain" is how much of the variance along the ray its observation would remove.
+    """
+    images = make_image_fn(toolbox, VARIANCE, _measures)
+
+    def fit(key, situation):
+        if toolbox.kind == VARIANCE:
+            return None
+        return toolbox.train(VARIANCE, key, situation)
+
+    def render(fitted, train, rays):
+        return images(train if fitted is None else fitted, rays)
+
+    return ModelFns(fit, render)
+
+
+MODEL = UncertaintyModel(
+    name="learned_variance",
+    summary="Variance of colour that the field learns by likelihood (ActiveNeRF).",
+    make_fns=make_fns,
+)

@@ -1,0 +1,47 @@
+"""WarpRF (Safadoust et al. 2025): does a render agree with training views warped into it?"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import numpy as np
+
+from bavs_jax.uncertainty.images import make_image_fn, render_stack
+from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
+from bavs_jax.uncertainty.warp import WarpSources, warp_disagreement
+
+
+def make_fns(toolbox: Toolbox) -> ModelFns:
+    """Renders of the training views are fitted."""
+    images = make_image_fn(toolbox, toolbox.kind)
+
+    @jax.jit
+    def disagreement(rays, rgb, depth, opacity, sources):
+        return warp_disagreement(rays, rgb, depth, opacity, sources)
+
+    def fit(key, situation):
+        del key
+        mask = np.asarray(situation.is_training_view)
+        cameras, rgb, depth = render_stack(
+            partial(images, situation.train),
+            situation.table.cameras,
+            mask,
+            scale=toolbox.image_scale,
+            chunk=toolbox.chunk,
+        )
+        return WarpSources(cameras, rgb, depth, mask)
+
+    def render(sources, train, rays):
+        out = images(train, rays)
+        uncertainty = disagreement(rays, out["rgb"], out["depth"], out["opacity"], sources)
+        return {**out, "uncertainty": uncertainty}
+
+    return ModelFns(fit, render)
+
+
+MODEL = UncertaintyModel(
+    name="warp",
+    summary="Disagreement of a render with training views warped into it by depth.",
+    make_fns=make_fns,
+)
