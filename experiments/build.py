@@ -22,7 +22,7 @@ from bavs_jax.training.batches import PixelTable, make_pixel_table
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.channel import SCALES, VARIANTS, vertex_variance
 from bavs_jax.uncertainty.curvature import WEIGHTINGS
-from bavs_jax.uncertainty.model import RECONSTRUCTION, LaplaceOptions, Toolbox
+from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, LaplaceOptions, Toolbox
 from bavs_jax.uncertainty.models import MODELS
 from bavs_jax.uncertainty.posterior import default_prior_weight
 from bavs_jax.uncertainty.scoring import make_render_chunk_fn
@@ -30,7 +30,7 @@ from bavs_jax.uncertainty.streaming import make_curvature_fn
 from bavs_jax.uncertainty.true_error import make_true_error_fn
 from experiments.build_field import field_background
 from experiments.build_scene import make_source
-from experiments.build_trainer import OBJECTIVES, build_trainer, calls_per_round, train_aside
+from experiments.build_trainer import KINDS, build_trainer, calls_per_round, train_aside
 from experiments.errors import ConfigError, check_choice
 
 RENDER_CHUNK = 4096  # rays of one compiled rendering call
@@ -81,7 +81,7 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
     Args:
       config: see `experiments/configs/base.py`.
       scene: the scene.
-      kind: of the field that the run trains and is measured on, a key of `OBJECTIVES`.
+      kind: of the field that the run trains and is measured on, one of `KINDS`.
 
     Raises:
       ConfigError: an option that cannot be used.
@@ -89,7 +89,7 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
     check_choices(config)
     table = make_pixel_table(scene)
     source, table = make_source(config, scene, table)
-    trainers = {k: build_trainer(config, scene, len(table.cameras), k) for k in OBJECTIVES}
+    trainers = {k: build_trainer(config, scene, len(table.cameras), k) for k in KINDS}
     trainer = trainers[kind]
     field, sampler = trainer.field, trainer.sampler
     background = field_background(scene)
@@ -155,6 +155,7 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
 
         return Toolbox(
             fields={name: (t.field, t.sampler) for name, t in trainers.items()},
+            flow=trainers[FLOW].flow,
             kind=kind,
             background=background,
             capacity=8 * RENDER_CHUNK,
@@ -165,6 +166,7 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
             image_scale=config.candidates.image_scale,
             chunk=RENDER_CHUNK,
             ensemble_size=config.uncertainty.ensemble_size,
+            num_draws=config.flow.draws,
         )
 
     @cache

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from bavs_jax.fields.base import DensityField, Field
+from bavs_jax.fields.flow_field import FlowField, make_flow_field, make_flow_mlp_field
 from bavs_jax.fields.hash_grid import make_hash_grid_density, make_hash_grid_field
 from bavs_jax.fields.nerf_mlp import make_mlp_density, make_nerf_mlp_field
 from bavs_jax.fields.positional import PIXEL_TO_RADIUS
@@ -87,6 +88,20 @@ def _make_field(config, scene: Scene, num_views: int, learned_variance: bool) ->
         pixel_radius=_pixel_radius(scene),
         **common,
     )
+
+
+def build_flow(config, scene: Scene) -> FlowField:
+    """The distribution over fields that goes with a config's kind of field."""
+    options = {**config.flow}
+    for name in ("train_draws", "draws", "entropy_weight", "floor"):
+        del options[name]
+    if config.field_kind == "hash_grid":
+        grid = {**config.field}
+        del grid["appearance_features"]
+        return make_flow_field(scene.box, contracted=scene.unbounded, **grid, **options)
+    trunk = config[config.field_kind]
+    shape = {n: trunk[n] for n in ("depth", "width", "skip", "position_degree", "direction_degree")}
+    return make_flow_mlp_field(scene.box, contracted=scene.unbounded, **shape, **options)
 
 
 def _pixel_radius(scene: Scene) -> float:

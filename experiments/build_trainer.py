@@ -10,12 +10,17 @@ import jax
 import numpy as np
 
 from bavs_jax.fields.base import Field
+from bavs_jax.fields.flow_field import FlowField, mean_field
 from bavs_jax.rendering.samplers import Sampler
 from bavs_jax.scenes import Scene
-from bavs_jax.training.objectives import make_colour_objective, make_variance_objective
+from bavs_jax.training.objectives import (
+    make_colour_objective,
+    make_flow_objective,
+    make_variance_objective,
+)
 from bavs_jax.training.train import TrainState, init_train_state, make_optimiser, make_train_fn
-from bavs_jax.uncertainty.model import RECONSTRUCTION, VARIANCE, Situation
-from experiments.build_field import build_field, field_background, learning_rate
+from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE, Situation
+from experiments.build_field import build_field, build_flow, field_background, learning_rate
 
 
 class Trainer(NamedTuple):
@@ -25,9 +30,10 @@ class Trainer(NamedTuple):
     sampler: Sampler
     init: Callable  # key -> TrainState
     call: Callable  # see `make_train_fn`
+    flow: FlowField | None  # the distribution over fields of which `field` is the mean
 
 
-OBJECTIVES = {RECONSTRUCTION: make_colour_objective, VARIANCE: make_variance_objective}
+KINDS = (RECONSTRUCTION, VARIANCE, FLOW)
 
 
 def build_trainer(config, scene: Scene, num_views: int, kind: str) -> Trainer:
@@ -37,10 +43,25 @@ def build_trainer(config, scene: Scene, num_views: int, kind: str) -> Trainer:
       config: see `experiments/configs/base.py`.
       scene: the scene.
       num_views: views of the pixel table.
-      kind: a key of `OBJECTIVES`.
+      kind: one of `KINDS`.
     """
     field, sampler = build_field(config, scene, num_views, learned_variance=kind == VARIANCE)
-    train = config.train
+    train, flow = config.train, None
+    rendering = {"background": field_background(scene), "capacity": train.capacity}
+    if kind == FLOW:
+        flow = build_flow(config, scene)
+        field = mean_field(flow)
+        objective = make_flow_objective(
+            flow,
+            num_draws=config.flow.train_draws,
+            entropy_weight=config.flow.entropy_weight,
+            floor=config.flow.floor,
+            **rendering,
+        )
+    elif kind == VARIANCE:
+        objective = make_variance_objective(field, **rendering)
+    else:
+        objective = make_colour_objective(field, **rendering)
     optimiser, schedule = make_optimiser(
         learning_rate=learning_rate(config),
         final_share=train.final_share,
@@ -49,7 +70,7 @@ def build_trainer(config, scene: Scene, num_views: int, kind: str) -> Trainer:
     call = make_train_fn(
         field,
         sampler,
-        OBJECTIVES[kind](field, background=field_background(scene), capacity=train.capacity),
+        objective,
         optimiser,
         schedule,
         num_rays=train.num_rays,
@@ -57,7 +78,7 @@ def build_trainer(config, scene: Scene, num_views: int, kind: str) -> Trainer:
         steps_per_call=train.steps_per_call,
     )
     init = jax.jit(partial(init_train_state, field=field, sampler=sampler, optimiser=optimiser))
-    return Trainer(field, sampler, init, call)
+    return Trainer(field, sampler, init, call, flow)
 
 
 def calls_per_round(config) -> int:

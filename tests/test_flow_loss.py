@@ -172,6 +172,6 @@ def test_one_pixel_learns_the_spread_of_what_it_sees():
 
 def test_entropy_keeps_spread_where_nothing_is_seen():
     colours = jnp.full((4, 3), 0.3)
-    for w in (0.0,0.01,0.1):
+    for w in (0.0, 0.01, 0.1):
         drawn = fit(jax.random.key(1), colours, w)
         print(w, drawn.mean(0), drawn.std(0))

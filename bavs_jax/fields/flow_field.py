@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bavs_jax.fields.base import Params
+from bavs_jax.fields.base import Field, Params
 from bavs_jax.fields.contraction import unit_coordinates
 from bavs_jax.fields.encodings import HashEncoding, level_resolutions, spherical_harmonics
 from bavs_jax.fields.flows import apply_flows, flow_from_raw, num_flow_parameters
@@ -49,6 +49,15 @@ def base_draws(key, num_draws: int, *, with_mean: bool = False) -> jax.Array:
     """Standard normal draws of the base [num_draws, 4]; `with_mean` makes the last one 0."""
     draws = jax.random.normal(key, (num_draws, NOISE_DIM))
     return draws.at[-1].set(0.0) if with_mean else draws
+
+
+def mean_field(flow: FlowField) -> Field:
+    """The field of the base's mean: one that can be sampled and rendered like any other."""
+
+    def apply(params, positions, directions):
+        return flow.apply(params, positions, directions, jnp.zeros(NOISE_DIM))
+
+    return Field(flow.init, apply, flow.density, flow.penalty)
 
 
 def positive_density(raw: jax.Array, scale) -> tuple[jax.Array, jax.Array]:
@@ -108,9 +117,7 @@ class SteeredFlows(nn.Module):
     def __call__(self, hidden):
         condition = nn.relu(nn.Dense(self.condition_features)(hidden))
         raw = nn.Dense(self.num_flows * num_flow_parameters(self.dim))(condition)
-        return flow_from_raw(
-            raw, dim=self.dim, num_flows=self.num_flows, amplitude=self.amplitude
-        )
+        return flow_from_raw(raw, dim=self.dim, num_flows=self.num_flows, amplitude=self.amplitude)
 
 
 class FlowNetwork(nn.Module):

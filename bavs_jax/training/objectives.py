@@ -14,10 +14,12 @@ import jax
 import jax.numpy as jnp
 
 from bavs_jax.fields.base import Field
+from bavs_jax.fields.flow_field import FlowField, base_draws
 from bavs_jax.numerics import MIN_VARIANCE
 from bavs_jax.rendering.compositing import rendered_variance
 from bavs_jax.rendering.render import Rendering, render_rays
 from bavs_jax.training.batches import PixelBatch
+from bavs_jax.training.flow_loss import flow_loss
 from bavs_jax.training.losses import colour_loss, gaussian_nll, weighted_mean
 
 
@@ -92,5 +94,50 @@ def make_variance_objective(
         kept = samples.sample_mask & out.ray_mask[:, None]
         density = weighted_mean(out.density, kept)
         return Outcome(loss + density_weight * density, out.rgb, out.weights, out.ray_mask)
+
+    return objective
+
+
+def make_flow_objective(
+    flow: FlowField,
+    *,
+    background,
+    capacity: int,
+    num_draws: int = 32,
+    entropy_weight: float = 0.01,
+    floor: float = 1e-5,
+) -> Callable:
+    """Likelihood of the colours under K draws of a distribution over fields (CF-NeRF).
+
+    Args:
+      flow: the distribution over fields.
+      background, capacity: see `make_colour_objective`.
+      num_draws: K, of the base, shared by all points; new ones in each step.
+      entropy_weight, floor: see `flow_loss`.
+    """
+
+    def objective(key, params, batch, samples):
+        def render(noise):
+            return render_rays(
+                batch.rays,
+                samples,
+                partial(flow.apply, params, noise=noise),
+                background=background,
+                capacity=capacity,
+                exact=False,
+            )
+
+        draws = jax.vmap(render)(base_draws(key, num_draws))
+        ray_mask = draws.ray_mask[0]
+        loss = flow_loss(
+            draws.rgb,
+            batch.rgb,
+            batch.ray_weight * ray_mask,
+            draws.values["log_prob"],
+            samples.sample_mask & ray_mask[:, None],
+            entropy_weight=entropy_weight,
+            floor=floor,
+        )
+        return Outcome(loss, draws.rgb.mean(0), draws.weights.mean(0), ray_mask)
 
     return objective

@@ -10,6 +10,7 @@ import jax
 from bavs_jax.cameras import Cameras
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.fields.flow_field import FlowField
 from bavs_jax.rendering.samplers import Sampler
 from bavs_jax.training.batches import PixelTable
 from bavs_jax.training.train import TrainState
@@ -17,6 +18,7 @@ from bavs_jax.training.train import TrainState
 # Kinds of fields.
 RECONSTRUCTION = "reconstruction"
 VARIANCE = "variance"  # with a learned variance of each point's colour
+FLOW = "flow"  # the mean of a distribution over fields
 
 
 class UncertaintyModel(NamedTuple):
@@ -69,6 +71,7 @@ class Toolbox(NamedTuple):
     """
 
     fields: dict[str, tuple[Field, Sampler]]  # by kind
+    flow: FlowField  # the distribution whose mean is the field of kind FLOW
     kind: str  # of the field that is trained and measured in this run
     background: Any  # [3], or None (see `composite_colour`)
     capacity: int  # places of the buffer in which samples are evaluated when rendering
@@ -79,6 +82,7 @@ class Toolbox(NamedTuple):
     image_scale: float = 0.25  # of width and height, for renders of whole views
     chunk: int = 4096  # rays of one compiled call
     ensemble_size: int = 3  # fields, the run's own among them
+    num_draws: int = 32  # of the distribution over fields
 
 
 class Situation(NamedTuple):

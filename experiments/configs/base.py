@@ -68,6 +68,15 @@ def get_config() -> ConfigDict:
     config.mip_mlp.proposal_depth = 2
     config.mip_mlp.proposal_width = 32
 
+    # --- the distribution over fields of "cf_nerf" (fields/flow_field.py) ---
+    config.flow = ConfigDict()
+    config.flow.condition_features = 32  # 64 in its paper
+    config.flow.num_flows = 4
+    config.flow.train_draws = 8  # in each training step; 32 in its paper
+    config.flow.draws = 16  # when rendering; 32 in its paper
+    config.flow.entropy_weight = 0.01
+    config.flow.floor = 1e-5  # added to the kernels' width, colours in [0, 1]
+
     # --- sampler_kind "coarse_to_fine" (rendering/coarse_to_fine.py); 64 and 128 in the paper ---
     config.coarse_to_fine = ConfigDict()
     config.coarse_to_fine.num_coarse = 24
