@@ -63,7 +63,8 @@ def run_all(config, folder: pathlib.Path, command: str) -> None:
 
 def main() -> None:
     if FLAGS.list_policies:
-        print("\n".join(POLICIES))
+        for name, policy in POLICIES.items():
+            print(f"{name:16} {policy.summary}")
         return
     if FLAGS.config is None:
         sys.exit("error: --config: is missing; try --config=experiments/configs/quickstart.py")

@@ -47,6 +47,7 @@ class Problem(NamedTuple):
     render: Callable  # (TrainState, jac_sq_sum or None, num_rays) -> (Rays [chunk] -> dict)
     curvature: Callable  # (TrainState, table, view_ids, within, progress_fn) -> jac_sq_sum
     density: Callable  # (TrainState, positions [K, 3]) -> density [K], 0 where nothing is rendered
+    make_toolbox: Callable  # track -> Toolbox
     model_fns: Callable  # (name of an uncertainty model, track) -> ModelFns
     lpips_fn: Callable | None
     lpips_reason: str | None
@@ -218,6 +219,7 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
         render=render,
         curvature=curvature,
         density=density,
+        make_toolbox=make_toolbox,
         model_fns=model_fns,
         lpips_fn=lpips_fn,
         lpips_reason=lpips_reason,

@@ -9,6 +9,7 @@ import os
 import pathlib
 import platform
 import time
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +17,7 @@ import numpy as np
 
 from bavs_jax.active import ActiveState, Choice, init_active_state
 from bavs_jax.training.checkpoints import Checkpoints
-from bavs_jax.uncertainty.model import RECONSTRUCTION
-from bavs_jax.uncertainty.streaming import training_pixels
+from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
 from experiments import acquisitions
 from experiments.baselines import measure_baselines
 from experiments.build import Problem, run_key
@@ -25,6 +25,7 @@ from experiments.build_scene import initial_views
 from experiments.evaluate import evaluate_views, picture_arrays, spread_evenly
 from experiments.files import append_line, write_arrays, write_json
 from experiments.progress import track
+from experiments.report.choices import bound_words
 
 SCHEMA_VERSION = 1
 PACKAGES = ("bavs_jax", "jax", "jaxlib", "flax", "optax", "numpy")
@@ -130,8 +131,11 @@ class Run:
             "survivors_farthest_overlap": (
                 int(info.survivors_farthest_overlap) if info.filter else None
             ),
+            "batch_bound": info.bound._asdict() if info.bound else None,
         }
         self._log(event="choice", round=number, **self.pending)
+        if info.bound:
+            print(f"{self.label}: {bound_words(self.pending['batch_bound'])}")
 
     def _measure_round(self, state: ActiveState, *, is_last: bool) -> None:
         config, scene = self.config, self.problem.scene
@@ -158,14 +162,15 @@ class Run:
         self._log(event="round", round=int(state.round), **row)
 
     def _uncertain_render_fn(self, state: ActiveState):
-        """Renders colour and uncertainty of a state that may have been picked up from disk."""
+        """Renders colour and uncertainty (Fig 4) of a state that may come from disk."""
         num_rays = int(np.diff(self.problem.scene.offsets)[self.initial].sum())
-        view_ids, within = training_pixels(state.table, state.is_training_view)
-        with track(len(view_ids), f"{self.label}: curvature for pictures", "rays") as bar:
-            jac_sq_sum = self.problem.curvature(
-                state.train, state.table, view_ids, within, bar.advance
-            )
-        return self.problem.render(state.train, jac_sq_sum, num_rays)
+        fns = self.problem.model_fns("laplace", track)
+        situation = Situation(
+            *(state.train, state.table, state.is_training_view, num_rays),
+            label=f"{self.label}: pictures",
+        )
+        fitted = fns.fit(jax.random.fold_in(run_key(self.seed), 2**31 - 2), situation)
+        return partial(fns.render, fitted, state.train)
 
     # --- files ---
 

@@ -125,7 +125,7 @@ FIELD = make_flow_field(
 
 @partial(jax.jit, static_argnames="num_steps")
 def fit(key, colours, entropy_weight, *, num_steps=400):
-    """Trains on one opaque point, seen in any of `colours` [M, 3]; colours drawn of both, [K, 2, 3].
+    """Trains on an opaque point, seen in any of `colours` [M, 3]; colours drawn of both, [K, 2, 3].
 
     A second point is never seen, but counts in the entropy.
     """

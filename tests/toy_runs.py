@@ -23,6 +23,9 @@ OVERRIDES = {
     "train.num_rays": 128,
     "train.capacity": 2048,
     "uncertainty.log2_cells": 3,
+    "uncertainty.ensemble_size": 2,
+    "flow.train_draws": 2,
+    "flow.draws": 3,
 }
 
 

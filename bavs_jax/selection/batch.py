@@ -18,6 +18,7 @@ from bavs_jax.selection.distances import (
     max_min_filter,
     nearest_distances,
 )
+from bavs_jax.selection.information import BatchBound
 from bavs_jax.selection.policy import MODES, Mode, Policy
 
 
@@ -33,6 +34,7 @@ class SelectionInfo(NamedTuple):
     # Of the n survivors, those among farthest-view's first n. If n is close to k, and this close
     # to n, then the filter has chosen, not the score.
     survivors_farthest_overlap: int
+    bound: BatchBound | None = None  # how far the batch can be from the best, where it is known
 
 
 def top_k(scores: jax.Array, mask: jax.Array, view_ids: jax.Array, *, k: int) -> jax.Array:
@@ -174,6 +176,7 @@ def acquire(
         filter=filter_info,
         farthest_overlap=int((ranks[selected] < k).sum()),
         survivors_farthest_overlap=int((ranks[survivors] < survivors.sum()).sum()),
+        bound=None if policy.bound_fn is None else policy.bound_fn(ctx, selected),
     )
 
 

@@ -21,12 +21,15 @@ class Policy(NamedTuple):
     `update_fn(ctx, index) -> ctx`: what changes for the policy once candidate `index` is in the
     batch (`acquire` has marked it already). None: candidates are valued independently, so
     "greedy" mode is refused.
+    `bound_fn(ctx, selected) -> BatchBound`: how far a batch can be from the best one of its size,
+    given the context before the first pick; None where nothing is known.
     """
 
     name: str  # also the name of its file
     summary: str  # one sentence
     score_fn: Callable[[jax.Array, Context], jax.Array]
     update_fn: Callable[[Context, int], Context] | None = None
+    bound_fn: Callable | None = None
     needs: frozenset[str] = frozenset()  # fields of `Context` that the caller must fill
     uncertainty: str = "laplace"  # the model behind `mean_uncertainty_fn` (uncertainty/models)
     measure: str = "uncertainty"  # which of the model's images its mean is taken of

@@ -18,4 +18,5 @@ def get_config():
     config.field.finest = 512
     config.field.appearance_features = 4
     config.train.num_steps = 4000
+    config.uncertainty.max_rays = 100_000
     return config

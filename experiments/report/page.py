@@ -177,6 +177,8 @@ def _filter_words(run: Run, one: choices.Round) -> str:
         words += f", {int(one.survives.sum())} left by the distance filter"
     if info.get("farthest_overlap") is not None:
         words += f"; farthest-view would share {info['farthest_overlap']}"
+    if info.get("batch_bound"):
+        words += f"; {choices.bound_words(info['batch_bound'])}"
     return words
 
 

@@ -109,12 +109,39 @@ def runs_table(runs: list[Run]) -> Table:
     return Table(tuple(head), tuple(rows))
 
 
-def timing_table(runs: list[Run], policies: list[str]) -> Table:
-    """Seconds of each part, all rounds of a run together, mean over completed runs."""
-    head = ("policy", *(label for label, _ in PARTS.values()), "together")
+def baseline_table(runs: list[Run], policies: list[str]) -> Table | None:
+    """The field against what can be had without one; None where views were chosen or none is known.
+
+    The gap is to the better of the two, seed by seed.
+    """
+    names = ("mean_colour_psnr", "nearest_image_psnr")
+    known = [run for run in stats.completed(runs) if run.result.get("baselines")]
+    if not known or any(len(run.rounds) > 1 for run in runs):
+        return None
     rows = []
     for policy in policies:
-        parts = [stats.mean_seconds(runs, policy, part) for part in PARTS]
+        mine = [run for run in known if run.policy == policy]
+        psnr = [run.rounds[-1]["psnr"] for run in mine]
+        guesses = [[run.result["baselines"][name] for run in mine] for name in names]
+        gaps = [p - max(pair) for p, *pair in zip(psnr, *guesses)]
+        why = f"{policy}: no completed run"
+        cells = [interval_cell(stats.mean_interval(v), 2, why) for v in (psnr, *guesses)]
+        gap = interval_cell(stats.mean_interval(gaps), 2, why, gap=True)
+        rows.append((Cell(policy), Cell(str(mine[0].rounds[-1]["num_test_views"])), *cells, gap))
+    head = ("policy", "held-out views", "field (dB)", "mean colour (dB)", "nearest photo (dB)")
+    return Table((*head, "above the better of the two (dB)"), tuple(rows))
+
+
+def timing_table(runs: list[Run], policies: list[str]) -> Table:
+    """Seconds of each part, all rounds of a run together, mean over completed runs.
+
+    Parts that no run has spent any time on are left out.
+    """
+    used = [p for p in PARTS if any(stats.mean_seconds(runs, policy, p) for policy in policies)]
+    head = ("policy", *(PARTS[part][0] for part in used), "together")
+    rows = []
+    for policy in policies:
+        parts = [stats.mean_seconds(runs, policy, part) for part in used]
         if None in parts:
             cells = [dash(f"{policy}: no completed run")] * (len(head) - 1)
         else:

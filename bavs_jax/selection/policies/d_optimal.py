@@ -2,8 +2,15 @@
 
 from functools import partial
 
+import numpy as np
+
 from bavs_jax.selection.context import require, score_candidates
-from bavs_jax.selection.information import add_curvature, candidate_gains, log_det_gain
+from bavs_jax.selection.information import (
+    add_curvature,
+    batch_upper_bound,
+    candidate_gains,
+    log_det_gain,
+)
 from bavs_jax.selection.policy import Policy
 
 
@@ -28,8 +35,13 @@ def make_informative(*, name, summary, gain) -> Policy:
     )
 
 
+def bound(ctx, selected):
+    """Against the best batch of all candidates that were allowed, filtered or not."""
+    return batch_upper_bound(require(ctx, "information"), selected, np.flatnonzero(ctx.mask))
+
+
 POLICY = make_informative(
     name="d_optimal",
     summary="Greedily the view of largest sum log(1 + h / H) over the field's posterior (POp-GS).",
     gain=log_det_gain,
-)
+)._replace(bound_fn=bound)
