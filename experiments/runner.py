@@ -204,10 +204,11 @@ class Run:
             self.folder / "acquisition.npz",
             **acquisitions.acquisition_arrays(scene, self.initial, choices),
         )
-        if completed:
+        if completed and self.seed == config.seeds[0]:
             view_ids = spread_evenly(scene.test, config.num_pictures)
             pictures = picture_arrays(self._uncertain_render_fn(state), scene, view_ids)
             write_arrays(self.folder / "pictures.npz", **pictures, round=int(state.round))
+        if completed:
             acquisitions.write_next_views(
                 self.folder / "next_views" / "transforms.json", scene, choices
             )

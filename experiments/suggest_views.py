@@ -31,7 +31,7 @@ flags.DEFINE_string("policy", "bavs", "Acquisition policy that chooses.")
 flags.DEFINE_integer("holdout", 0, "Photos left out of training, to measure the field on.")
 flags.DEFINE_string("loader", "auto", "Layout of the folder; auto: by the files in it.")
 flags.DEFINE_integer("image_size", 135, "Width in pixels to which the widest photo is reduced.")
-flags.DEFINE_integer("train_steps", 1600, "Optimiser steps of the field.")
+flags.DEFINE_integer("train_steps", 2400, "Optimiser steps of the field.")
 config_flags.DEFINE_config_dict(
     "config",
     settings.default_config(),

@@ -8,7 +8,7 @@ import pathlib
 import numpy as np
 
 from bavs_jax.placement.collect import PlacementError
-from experiments.configs import base
+from experiments.configs import capture
 
 KINDS = ("shell", "hemisphere", "box", "file")
 
@@ -80,10 +80,10 @@ def parse_bounds(text: str) -> np.ndarray | None:
 
 def default_config():
     """The config of a field that is trained once on every photo of a capture."""
-    config = base.get_config()
+    config = capture.get_config()
     config.loader, config.image_size = "auto", 135
     config.holdout = 0  # photos left out of training, to measure the field on
-    config.train.num_steps = 1600
+    config.train.num_steps = 2400
     config.lpips_net = ""
     config.checkpoint_seconds = 20.0
     # Every photo's rays weigh in the curvature through a uniform subset, scaled up.
