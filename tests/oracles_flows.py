@@ -30,9 +30,7 @@ def invert_flow(r1, r2, b, image, *, reverse: bool):
 def invert_flows(r1, r2, b, image):
     """The point [D] that all flows in turn carry to `image` [D]; parameters are [F, D, ...]."""
     for number in reversed(range(len(b))):
-        image = invert_flow(
-            r1[number], r2[number], b[number], image, reverse=number % 2 == 1
-        )
+        image = invert_flow(r1[number], r2[number], b[number], image, reverse=number % 2 == 1)
     return image
 
 

@@ -108,9 +108,7 @@ class SteeredFlows(nn.Module):
     def __call__(self, hidden):
         condition = nn.relu(nn.Dense(self.condition_features)(hidden))
         raw = nn.Dense(self.num_flows * num_flow_parameters(self.dim))(condition)
-        return flow_from_raw(
-            raw, dim=self.dim, num_flows=self.num_flows, amplitude=self.amplitude
-        )
+        return flow_from_raw(raw, dim=self.dim, num_flows=self.num_flows, amplitude=self.amplitude)
 
 
 class FlowNetwork(nn.Module):

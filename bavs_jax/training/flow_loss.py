@@ -125,7 +125,5 @@ def flow_loss(
     Returns:
       [] nats.
     """
-    likelihood = colour_likelihood_loss(
-        draws, target, ray_weight, exponent=exponent, floor=floor
-    )
+    likelihood = colour_likelihood_loss(draws, target, ray_weight, exponent=exponent, floor=floor)
     return likelihood + entropy_weight * mean_log_prob(log_prob, sample_mask)
