@@ -20,6 +20,10 @@ from tests.oracles_flows import invert_flows
 BOX = np.array([[-1.0, -2.0, -1.0], [1.0, 2.0, 3.0]], np.float32)
 NUM_FLOWS = 4
 
+# Compiled once for all tests of one shape.
+stack = jax.jit(apply_flows)
+jacobian_of = jax.jit(jax.jacfwd(lambda flows, z: apply_flows(flows, z)[0], argnums=1))
+
 
 @pytest.fixture
 def x64():
@@ -59,11 +63,11 @@ def test_log_determinant_is_that_of_the_jacobian(x64, dim):
     for seed in range(5):
         flows = flows_of(seed, dim)
         z = jnp.asarray(np.random.default_rng(100 + seed).normal(size=dim))
-        jacobian = jax.jacfwd(lambda z, flows=flows: apply_flows(flows, z)[0])(z)
+        jacobian = jacobian_of(flows, z)
         sign, want = np.linalg.slogdet(jacobian)
         assert sign == 1
         # float64; the determinant is a product of at most 12 slopes, none below 0.002.
-        np.testing.assert_allclose(apply_flows(flows, z)[1], want, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(stack(flows, z)[1], want, rtol=1e-9, atol=1e-12)
         if dim > 1:
             assert np.abs(jacobian - np.diag(np.diag(jacobian))).max() > 1e-2  # coordinates mix
 
@@ -95,7 +99,7 @@ def test_inverse_by_bisection_comes_back(x64, dim, scale):
     for seed in range(3):
         flows = flows_of(seed, dim, scale=scale)
         z = 2.0 * np.random.default_rng(200 + seed).normal(size=dim)
-        image, log_det = apply_flows(flows, jnp.asarray(z))
+        image, log_det = stack(flows, jnp.asarray(z))
         # Rounding grows by the inverse's slope: 1 / 0.002^4 per coordinate at the worst, and the
         # steepest of these stacks, at a scale of 5, is near to it.
         atol = 1e-9 if scale == 1.0 else 1e-4
@@ -109,7 +113,7 @@ def test_one_dimension_increases_and_moves_by_a_bounded_amount(x64, amplitude, e
     z = jnp.linspace(-20.0, 20.0, 4001)
     for seed in range(5):
         flows = flows_of(seed, 1, scale=extreme, amplitude=amplitude)
-        image = apply_flows(jax.tree.map(lambda x: x[..., None], flows), z[None])[0][0]
+        image = stack(jax.tree.map(lambda x: x[..., None], flows), z[None])[0][0]
         assert (jnp.diff(image) > 0).all()
         assert float(jnp.abs(image - z).max()) <= NUM_FLOWS * amplitude
 
@@ -166,7 +170,7 @@ def test_log_prob_is_the_change_of_variables_from_noise_to_density_and_colour(x6
 def test_density_of_the_density_integrates_to_1(x64):
     flows = jax.tree.map(lambda x: x[..., None], flows_of(2, 1))
     z = jnp.linspace(-9.0, 9.0, 20_001)
-    raw, log_det = apply_flows(flows, z[None])
+    raw, log_det = stack(flows, z[None])
     density, log_slope = positive_density(raw[0], 50.0)
     log_prob = -0.5 * (jnp.square(z) + jnp.log(2 * jnp.pi)) - log_det - log_slope
     # The trapezoid rule at 20,000 points; the tails beyond 9 hold 1e-19.
@@ -179,7 +183,7 @@ def test_density_of_the_colour_integrates_to_1_over_the_cube(x64):
     num = 2000
     colours = np.random.default_rng(0).uniform(size=(num, 3))
     start = np.stack([invert_flows(*flows, np.log(c) - np.log1p(-c)) for c in colours], axis=1)
-    raw, log_det = apply_flows(jax.tree.map(lambda x: x[..., None], flows), jnp.asarray(start))
+    raw, log_det = stack(jax.tree.map(lambda x: x[..., None], flows), jnp.asarray(start))
     rgb, log_slope = unit_colour(raw)
     np.testing.assert_allclose(rgb.T, colours, atol=1e-9)
     base = -0.5 * (np.square(start) + np.log(2 * np.pi)).sum(0)
