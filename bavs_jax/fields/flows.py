@@ -74,14 +74,19 @@ def flow_from_raw(
     )
 
 
-def _upper_product(matrix: jax.Array, z: list[jax.Array]) -> list[jax.Array]:
-    """`R z` for an upper triangular R [D, D, ...], component by component.
+def _unstack(x: jax.Array) -> list[jax.Array]:
+    """`[x[0], x[1], ...]`, with one concatenation as its gradient, not a padded sum for each."""
+    return [row[0] for row in jax.lax.split(x, (1,) * x.shape[0])]
+
+
+def _upper_product(matrix: list[list[jax.Array]], z: list[jax.Array]) -> list[jax.Array]:
+    """`R z` for an upper triangular R, component by component.
 
     Spelt out, so that XLA for CPUs makes one loop along the points of it: a sum over the axis of
     components, be it of three, runs fifty times slower.
     """
     dim = len(z)
-    return [sum(matrix[i, j] * z[j] for j in range(i, dim)) for i in range(dim)]
+    return [sum(matrix[i][j] * z[j] for j in range(i, dim)) for i in range(dim)]
 
 
 def apply_flow(flow: SylvesterFlow, z: jax.Array, *, reverse: bool) -> tuple[jax.Array, jax.Array]:
@@ -98,15 +103,14 @@ def apply_flow(flow: SylvesterFlow, z: jax.Array, *, reverse: bool) -> tuple[jax
     Returns:
       `z'` [D, ...] and `log |det dz'/dz|` [...].
     """
-    dim = len(z)
-    order = range(dim)[:: -1 if reverse else 1]
-    hidden = _upper_product(flow.r2, [z[i] for i in order])
-    hidden = [jnp.tanh(x + flow.b[i]) for i, x in enumerate(hidden)]
-    slopes = [
-        1.0 + flow.r1[i, i] * flow.r2[i, i] * (1.0 - jnp.square(hidden[i])) for i in range(dim)
-    ]
-    moved = _upper_product(flow.r1, hidden)
-    return z + jnp.stack([moved[i] for i in order]), jnp.log(math.prod(slopes))
+    r1, r2 = ([_unstack(row) for row in _unstack(matrix)] for matrix in (flow.r1, flow.r2))
+    order = range(len(z))[:: -1 if reverse else 1]
+    z = _unstack(z)
+    inner = _upper_product(r2, [z[i] for i in order])
+    hidden = [jnp.tanh(x + shift) for x, shift in zip(inner, _unstack(flow.b))]
+    moved = _upper_product(r1, hidden)
+    slopes = [1.0 + r1[i][i] * r2[i][i] * (1.0 - jnp.square(x)) for i, x in enumerate(hidden)]
+    return jnp.stack([z[i] + moved[order[i]] for i in range(len(z))]), jnp.log(math.prod(slopes))
 
 
 def apply_flows(flows: SylvesterFlow, z: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -120,8 +124,7 @@ def apply_flows(flows: SylvesterFlow, z: jax.Array) -> tuple[jax.Array, jax.Arra
       `z'` [D, ...] and `log |det dz'/dz|` [...], summed over the flows.
     """
     log_det = 0.0
-    for number in range(flows.b.shape[0]):
-        one = SylvesterFlow(*(x[number] for x in flows))
-        z, change = apply_flow(one, z, reverse=number % 2 == 1)
+    for number, flow in enumerate(zip(*map(_unstack, flows))):
+        z, change = apply_flow(SylvesterFlow(*flow), z, reverse=number % 2 == 1)
         log_det += change
     return z, log_det
