@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from bavs_jax.cameras import Cameras, take
+from bavs_jax.scenes.base import photo_cameras
 from bavs_jax.scenes.poses import user_transforms
 from experiments.files import write_arrays, write_json
 
@@ -86,11 +87,13 @@ def acquisition_arrays(scene, initial, choices: list[dict]) -> dict[str, np.ndar
 def write_next_views(path: pathlib.Path, scene, choices: list[dict]) -> None:
     """Writes the chosen poses as a nerfstudio `transforms.json`, in the user's coordinates.
 
-    Frames come in the order of choosing; `round`, `rank` and `score` say when and why.
+    Intrinsics are for the size of the scene's files. Frames come in the order of choosing; `round`,
+    `rank` and `score` say when and why.
     """
     frames = []
     for number, choice in enumerate(choices, start=1):
         cameras = Cameras(**{name: choice[name] for name in CAMERA_FIELDS})
+        cameras = photo_cameras(scene, cameras)
         poses = user_transforms(scene, cameras.world_from_cam)
         for rank, index in enumerate(choice["selected"]):
             view_id = int(choice["candidate_ids"][index])

@@ -215,6 +215,9 @@ def test_camera_path_has_the_viewers_form(written):
     assert data["camera_type"] == "perspective" and data["is_cycle"] is False
     for view, pose in zip(data["camera_path"], poses, strict=True):
         np.testing.assert_allclose(np.reshape(view["camera_to_world"], (4, 4)), pose)
+        # Trained at half the size; a photo is taken at the size of the others.
+        assert (frame["w"], frame["h"]) == (48, 32)
+        np.testing.assert_allclose([frame["fl_x"], frame["fl_y"]], [60.0, 62.0], rtol=1e-6)
         # nerfstudio: focal = height / 2 / tan(fov / 2), fov vertical in degrees.
         focal = 0.5 * data["render_height"] / math.tan(math.radians(view["fov"]) / 2)
         np.testing.assert_allclose([focal, view["aspect"]], [32.0, 40 / 60], rtol=1e-6)
@@ -262,7 +265,7 @@ def script(*flags, cache):
 def finished(tmp_path_factory):
     """The script on a capture of 8 noise images, with a route."""
     base = tmp_path_factory.mktemp("suggest")
-    data = write_nerfstudio(base / "capture", width=24, height=16, fl_x=30.0, fl_y=30.0)
+    data = write_nerfstudio(base / "capture", width=48, height=32, fl_x=60.0, fl_y=62.0)
     flags = [f"--data={data}", f"--workdir={base / 'out'}", "--image_size=24", "--train_steps=16"]
     flags += ["--num_views=3", "--num_candidates=12", "--score_scale=0.5"]
     done = script(*flags, "--route", "--start=4,0,1", "--holdout=2", cache=base)

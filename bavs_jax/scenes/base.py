@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from bavs_jax.cameras import Cameras
+from bavs_jax.cameras import Cameras, rescale
 
 
 class SceneError(ValueError):
@@ -36,6 +36,7 @@ class Scene:
     depth: np.ndarray | None = None  # [N] float32 distance along the ray, 0 where unknown or empty
     pixel_mask: np.ndarray | None = None  # [N] bool, False: ignore this pixel
     unbounded: bool = False  # content reaches beyond the box, as in most real captures
+    photo_sizes: np.ndarray | None = None  # [V, 2] int32 pixels of the files; None: not reduced
     # [4, 4] float64 similarity from scene coordinates to those of the user's own file.
     user_from_scene: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(4))
 
@@ -70,6 +71,22 @@ class Scene:
             return None
         width, height = (int(n) for n in self.cameras.sizes[view_id])
         return self.pixel_mask[self.view_slice(view_id)].reshape(height, width)
+
+
+def photo_cameras(scene: Scene, cameras: Cameras) -> Cameras:
+    """Cameras as one would take photos with them: at the sizes of the scene's files.
+
+    Args:
+      scene: the scene.
+      cameras: with the image sizes of some of its views, which may have been reduced.
+    """
+    if scene.photo_sizes is None:
+        return cameras
+    by_size = {
+        tuple(small): whole
+        for small, whole in zip(np.asarray(scene.cameras.sizes).tolist(), scene.photo_sizes)
+    }
+    return rescale(cameras, [by_size[tuple(size)] for size in np.asarray(cameras.sizes).tolist()])
 
 
 def pixel_table(images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -61,7 +61,7 @@ def load_split(root: pathlib.Path, split: str, *, image_size, background, strict
     files = [images.find_image(root, frame["file_path"]) for frame in frames]
     kept = checks.keep_existing(frames, files, path, strict=strict)
 
-    views = {"poses": [], "intrinsics": [], "images": [], "depths": [], "names": []}
+    views = {"poses": [], "intrinsics": [], "images": [], "depths": [], "names": [], "sizes": []}
     original = None
     for index in kept:
         field = f"frames[{index}].transform_matrix"
@@ -79,6 +79,7 @@ def load_split(root: pathlib.Path, split: str, *, image_size, background, strict
         views["intrinsics"].append(
             [focal * size[0] / width, focal * size[1] / height, 0.5 * size[0], 0.5 * size[1]]
         )
+        views["sizes"].append((width, height))
         views["names"].append(checks.view_name(files[index], root))
     checks.check_places(np.stack(views["poses"]), path)
     return views
@@ -140,4 +141,5 @@ def load_blender(
         background=np.asarray(background, np.float32),
         names=tuple(views["names"]),
         depth=depth,
+        photo_sizes=np.array(views["sizes"], np.int32),
     )

@@ -128,6 +128,7 @@ def make_scene(
         depth=depth_table(capture, cameras, unit),
         pixel_mask=mask_table(capture, cameras),
         unbounded=unbounded,
+        photo_sizes=np.asarray(capture.cameras.sizes, np.int32),
         user_from_scene=capture.user_from_file @ np.linalg.inv(scene_from_file),
     )
 

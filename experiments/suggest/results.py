@@ -9,6 +9,7 @@ import numpy as np
 from bavs_jax.cameras import Cameras, take
 from bavs_jax.placement.collect import Proposals
 from bavs_jax.rendering.images import render_views
+from bavs_jax.scenes.base import photo_cameras
 from bavs_jax.scenes.poses import user_transforms
 from bavs_jax.selection.route import route_length, shortest_route
 from bavs_jax.uncertainty.scoring import reduced_cameras
@@ -131,6 +132,7 @@ def write_results(
     rows = make_rows(suggestion, order)
     chosen = suggestion.selected[order]
     picked_cameras, poses = take(cameras, chosen), user_poses[chosen]
+    as_photos = photo_cameras(scene, picked_cameras)
 
     files = {
         "poses": folder / "next_views" / "transforms.json",
@@ -138,14 +140,14 @@ def write_results(
         "table": folder / "next_views" / "next_views.csv",
         "report": folder / "report.html",
     }
-    exports.write_transforms(files["poses"], poses, picked_cameras, rows)
-    exports.write_camera_path(files["camera path"], poses, picked_cameras)
+    exports.write_transforms(files["poses"], poses, as_photos, rows)
+    exports.write_camera_path(files["camera path"], poses, as_photos)
     # nerfstudio renders a camera path in the coordinates of its own normalisation, which are the
     # scene's: levelled, centred and scaled as by its defaults.
     normalised = files["camera path"].with_name("camera_path_normalised.json")
     scene_poses = np.tile(np.eye(4), (len(chosen), 1, 1))
     scene_poses[:, :3] = picked_cameras.world_from_cam
-    exports.write_camera_path(normalised, scene_poses, picked_cameras)
+    exports.write_camera_path(normalised, scene_poses, as_photos)
     exports.write_csv(files["table"], poses, rows)
 
     pixels, photo_level = photo_levels(problem, train, jac_sq_sum, options.score_scale)
