@@ -170,13 +170,15 @@ def test_photos_see_what_is_before_them_and_not_behind_the_ball():
 
 
 def test_worth_in_words():
-    worth = Worth(np.array([0.6, 0.5]), np.array([0.6, 0.55, 0.45]))
-    words = page.worth_sentence(worth, 0.4)
-    assert "75% of the first" in words and "25% of the first pick:" in words
-    assert "no more than the median photo" in page.worth_sentence(worth, 0.7)
-    assert "No candidate is left" in page.worth_sentence(
-        Worth(np.array([0.6]), np.array([0.6, np.nan])), 0.4
-    )
+    worth = Worth(np.array([60.0, 50.0]), np.array([60.0, 55.0, 45.0]))
+    words = page.worth_sentence(worth, 40.0)
+    assert "75% of what the first pick tells (60 nats)" in words and "would tell 67%" in words
+    assert "less and less" in words
+    assert "good place to stop" in page.worth_sentence(worth, 44.0)
+    assert "still worth taking" in page.worth_sentence(worth, 10.0)
+    assert "no more than another photo" in page.worth_sentence(worth, 70.0)
+    nothing_left = Worth(np.array([60.0]), np.array([60.0, np.nan]))
+    assert "No candidate is left" in page.worth_sentence(nothing_left, 40.0)
 
 
 # --- files ---
@@ -215,9 +217,6 @@ def test_camera_path_has_the_viewers_form(written):
     assert data["camera_type"] == "perspective" and data["is_cycle"] is False
     for view, pose in zip(data["camera_path"], poses, strict=True):
         np.testing.assert_allclose(np.reshape(view["camera_to_world"], (4, 4)), pose)
-        # Trained at half the size; a photo is taken at the size of the others.
-        assert (frame["w"], frame["h"]) == (48, 32)
-        np.testing.assert_allclose([frame["fl_x"], frame["fl_y"]], [60.0, 62.0], rtol=1e-6)
         # nerfstudio: focal = height / 2 / tan(fov / 2), fov vertical in degrees.
         focal = 0.5 * data["render_height"] / math.tan(math.radians(view["fov"]) / 2)
         np.testing.assert_allclose([focal, view["aspect"]], [32.0, 40 / 60], rtol=1e-6)
@@ -284,6 +283,9 @@ def test_script_writes_poses_that_agree_with_each_other(finished):
     for frame, view, row in zip(frames, path, rows):
         pose = np.array(frame["transform_matrix"])
         np.testing.assert_allclose(np.reshape(view["camera_to_world"], (4, 4)), pose)
+        # Trained at half the size; a photo is taken at the size of the others.
+        assert (frame["w"], frame["h"]) == (48, 32)
+        np.testing.assert_allclose([frame["fl_x"], frame["fl_y"]], [60.0, 62.0], rtol=1e-6)
         np.testing.assert_allclose([float(row[k]) for k in "xyz"], pose[:3, 3], rtol=1e-6)
         # The capture is an orbit of radius 4 at height 1 about the origin, which has no noise in
         # its heights and distances: the shell reaches about the noise beyond.

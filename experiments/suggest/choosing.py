@@ -3,23 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.cameras import Cameras, take
+from bavs_jax.candidates import Candidates
 from bavs_jax.selection.batch import SelectionInfo, acquire
 from bavs_jax.selection.context import SelectionError, make_context
+from bavs_jax.selection.information import (
+    Information,
+    add_curvature,
+    candidate_gains,
+    log_det_gain,
+    make_cached_curvature_fn,
+)
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.selection.worth import Worth, worth_along
+from bavs_jax.sources import make_candidate_curvature_fn
 from bavs_jax.training.train import TrainState
+from bavs_jax.uncertainty.model import Situation
+from bavs_jax.uncertainty.posterior import posterior_precision
 from bavs_jax.uncertainty.scoring import mean_uncertainty, reduced_cameras
 from experiments.build import RENDER_CHUNK, Problem
+from experiments.evaluate import spread_evenly
 from experiments.progress import track
 
-SUPPORTED_NEEDS = {"mean_uncertainty_fn"}
+SUPPORTED_NEEDS = {"mean_uncertainty_fn", "information"}
+NUM_COMPARED = 8  # photos whose repetition is what new views are compared with
 
 
 class Suggestion(NamedTuple):
@@ -28,7 +41,8 @@ class Suggestion(NamedTuple):
     selected: np.ndarray  # [k] indices of candidates
     scores: np.ndarray  # [C] Eq 15 for all candidates
     info: SelectionInfo
-    worth: Worth
+    worth: Worth  # of what each pick tells, and the best one left would tell, nats
+    photo_gain: float  # what one more photo from where there is one would tell, nats
 
 
 def check_policy(name: str) -> None:
@@ -61,32 +75,41 @@ def photo_rays(problem: Problem) -> int:
     return int(np.diff(problem.scene.offsets)[problem.scene.pool].sum())
 
 
-def make_add_fn(problem: Problem, train: TrainState, cameras: Cameras, scale: float) -> Callable:
-    """Makes `add(jac_sq_sum, index) -> jac_sq_sum` with a candidate's photo in it.
+def photo_information(
+    problem: Problem, train: TrainState, jac_sq_sum, cameras: Cameras, scale: float
+) -> Information:
+    """The posterior after all photos, and what each of C cameras' photos would add to it.
 
-    The sum of Eq 13 knows no colours, so a pose is enough. It runs over the pixels of a reduced
-    image and is scaled up to the number of pixels that the photo would have.
+    The sum of Eq 13 knows no colours, so a pose is enough.
     """
-    small = reduced_cameras(cameras, scale)
-    table = problem.table
+    toolbox = problem.make_toolbox(track)
+    is_training = np.zeros(len(problem.table.cameras), bool)
+    is_training[problem.scene.pool] = True
+    situation = Situation(train, problem.table, is_training, photo_rays(problem))
+    candidates = Candidates(cameras, np.arange(len(cameras)), np.ones(len(cameras), bool))
+    precision = posterior_precision(
+        jac_sq_sum,
+        num_rays=situation.num_rays,
+        prior_weight=toolbox.laplace.prior_weight,
+        weighting=toolbox.laplace.weighting,
+    )
+    return Information(
+        precision,
+        make_cached_curvature_fn(
+            make_candidate_curvature_fn(toolbox, situation, candidates, scale),
+            num_vertices=toolbox.grid.num_vertices,
+        ),
+    )
 
-    def add(jac_sq_sum, index):
-        # The candidate stands in for view 0, so that all arrays keep the shapes of the photos'
-        # table and nothing is compiled anew; its pixels are not looked at.
-        stand_in = jax.tree.map(
-            lambda x, y: jnp.asarray(x).at[0].set(y[index]), table.cameras, small
-        )
-        num = int(np.prod(np.asarray(small.sizes)[index]))
-        added = problem.curvature(
-            train,
-            table.replace(cameras=stand_in),
-            np.zeros(num, np.int32),
-            np.arange(num, dtype=np.int32),
-        )
-        whole = float(np.prod(np.asarray(cameras.sizes)[index]))
-        return jac_sq_sum + (whole / num) * added
 
-    return add
+def information_gains(information: Information, num: int, label: str) -> np.ndarray:
+    """What each of `num` cameras would tell, `sum log(1 + h / H)`, nats [num]."""
+    gains = []
+    with track(num, label, "views") as bar:
+        for index in range(num):
+            gains.append(candidate_gains(information, [index], gain=log_det_gain)[0])
+            bar.advance()
+    return np.array(gains)
 
 
 def suggest(
@@ -101,7 +124,7 @@ def suggest(
     scale: float,
     seed: int,
 ) -> Suggestion:
-    """Chooses `num_views` candidates and follows the score of the best one left.
+    """Chooses `num_views` candidates and follows what the best one left would still tell.
 
     Args:
       problem, train, jac_sq_sum: the field, and the curvature of the photos.
@@ -120,6 +143,8 @@ def suggest(
     num_rays = int(np.prod(np.asarray(reduced_cameras(cameras, scale).sizes), axis=-1).sum())
     with track(num_rays, f"score {len(cameras)} candidates", "rays") as bar:
         scores = score(jac_sq_sum, np.arange(len(cameras)), bar.advance)
+    information = photo_information(problem, train, jac_sq_sum, cameras, scale)
+    gains = information_gains(information, len(cameras), "what candidates would tell")
     is_training = np.zeros(scene.num_views, bool)
     is_training[scene.pool] = True
     context = make_context(
@@ -128,17 +153,19 @@ def suggest(
         is_training_view=is_training,
         centre=centre,
         mean_uncertainty_fn=lambda indices, picked: scores[indices],
+        information=information,
     )
     key = jax.random.fold_in(jax.random.key(seed), 1)
     selected, info = acquire(get_policy(policy), key, context, num_views)
 
-    add = make_add_fn(problem, train, cameras, scale)
-    with track(num_views, "what is left to gain", "views") as bar:
-
-        def add_and_report(state, index):
-            state = jax.block_until_ready(add(state, index))
-            bar.advance()
-            return state
-
-        worth = worth_along(jac_sq_sum, selected, scores, add_fn=add_and_report, score_fn=score)
-    return Suggestion(selected, scores, info, worth)
+    worth = worth_along(
+        information,
+        selected,
+        gains,
+        add_fn=add_curvature,
+        score_fn=partial(candidate_gains, gain=log_det_gain),
+    )
+    photos = take(scene.cameras, spread_evenly(scene.pool, NUM_COMPARED))
+    again = photo_information(problem, train, jac_sq_sum, photos, scale)
+    photo_gains = information_gains(again, len(photos), "what photos would tell again")
+    return Suggestion(selected, scores, info, worth, float(np.median(photo_gains)))

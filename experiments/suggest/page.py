@@ -59,27 +59,29 @@ def preview_cards(images: list[dict], rows: list[dict], sentences: list[str]) ->
     return cards, bar
 
 
-def worth_sentence(worth: Worth, photo_level: float) -> str:
-    """How much is left to gain, so that the user can judge when to stop."""
+def worth_sentence(worth: Worth, photo_gain: float) -> str:
+    """How much is left to gain, so that the user can judge when to stop.
+
+    Args:
+      worth: along the picks, nats.
+      photo_gain: of one more photo from where there is one already, nats.
+    """
     num, first, left = len(worth.picked), worth.picked[0], worth.best_left[-1]
     if math.isnan(left):
         return f"No candidate is left after these {num}: draw more to see what else there is."
     words = (
-        f"After {'this pose' if num == 1 else f'these {num}'}, the best candidate left scores "
-        f"{left:.3f}, which is {left / first:.0%} of the first pick's {first:.3f}."
+        f"After {'this pose' if num == 1 else f'these {num}'}, the best candidate left would tell "
+        f"{left / first:.0%} of what the first pick tells ({first:.3g} nats)"
     )
-    if first <= photo_level:
+    if first <= photo_gain:
         return words + (
-            f" Even the first pick scores no more than the median photo ({photo_level:.3f}): "
-            "the candidates hardly show anything that the photos do not."
+            f"; but even the first pick tells no more than another photo from where there is one "
+            f"already ({photo_gain:.3g} nats): the candidates hardly show anything new."
         )
-    excess = max(left - photo_level, 0.0) / (first - photo_level)
-    words += (
-        f" Counted above {photo_level:.3f}, the median of the photos that are there already, "
-        f"it is worth {excess:.0%} of the first pick:"
-    )
+    words += f"; another photo from where there is one already would tell {photo_gain / first:.0%}."
+    excess = max(left - photo_gain, 0.0) / (first - photo_gain)
     if excess >= 0.5:
-        return words + " further views are still worth taking."
+        return words + " Further views are still worth taking."
     if excess >= 0.2:
-        return words + " further views gain less and less."
-    return words + " there is little left to gain, this is a good place to stop."
+        return words + " Further views gain less and less."
+    return words + " There is little left to gain: this is a good place to stop."

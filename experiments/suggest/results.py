@@ -72,8 +72,8 @@ def render_previews(problem: Problem, train, jac_sq_sum, cameras: Cameras) -> li
         )
 
 
-def photo_levels(problem: Problem, train, jac_sq_sum, scale: float):
-    """Uncertainty of the photos' pixels, and the median of their scores, at the reduced size."""
+def photo_uncertainty(problem: Problem, train, jac_sq_sum, scale: float) -> np.ndarray:
+    """Uncertainty of all pixels of the photos at the reduced size."""
     small = reduced_cameras(take(problem.scene.cameras, problem.scene.pool), scale)
     render = problem.render(train, jac_sq_sum, photo_rays(problem))
     num_rays = int(np.prod(np.asarray(small.sizes), axis=-1).sum())
@@ -85,9 +85,7 @@ def photo_levels(problem: Problem, train, jac_sq_sum, scale: float):
             chunk=RENDER_CHUNK,
             progress_fn=bar.advance,
         )
-    scores = [float(image["uncertainty"].mean()) for image in images]
-    pixels = np.concatenate([image["uncertainty"].ravel() for image in images])
-    return pixels, float(np.median(scores))
+    return np.concatenate([image["uncertainty"].ravel() for image in images])
 
 
 def write_results(
@@ -150,7 +148,7 @@ def write_results(
     exports.write_camera_path(normalised, scene_poses, as_photos)
     exports.write_csv(files["table"], poses, rows)
 
-    pixels, photo_level = photo_levels(problem, train, jac_sq_sum, options.score_scale)
+    pixels = photo_uncertainty(problem, train, jac_sq_sum, options.score_scale)
     images = render_previews(problem, train, jac_sq_sum, picked_cameras)
     facts = pose_facts(
         scene,
@@ -160,7 +158,7 @@ def write_results(
         photo_uncertainty=pixels,
         density_fn=density_fn,
     )
-    worth_words = page.worth_sentence(suggestion.worth, photo_level)
+    worth_words = page.worth_sentence(suggestion.worth, suggestion.photo_gain)
     foggy = photos_in_matter(scene, density_fn, around)
     _write_summary(folder / "suggestion.json", suggestion, proposals, rows, facts, worth_words)
 
@@ -192,9 +190,7 @@ def write_results(
             start=around.to_scene(start) if options.route else None,
         ),
         candidates=_candidate_words(options, proposals, suggestion, around),
-        worth_curve=plots.worth_plot(
-            suggestion.worth, float(suggestion.worth.picked[0]), photo_level
-        ),
+        worth_curve=plots.worth_plot(suggestion.worth, suggestion.photo_gain),
         table=_table(rows, poses, facts),
         command=command,
         details=_details(problem, options, around, quality, foggy, seconds_fn()),
@@ -301,8 +297,9 @@ def _write_summary(path, suggestion: Suggestion, proposals, rows, facts, worth_w
         "drawn": proposals.num_drawn,
         "kept": len(proposals.poses),
         "dropped": proposals.dropped,
-        "first_score": float(first),
+        "first_gain": float(first),  # nats, as the next two
         "best_left": left,
+        "photo_gain": suggestion.photo_gain,
         "worth": worth_words,
         "views": [
             row | {"share_high": fact.share_high, "why": fact.sentence()}
