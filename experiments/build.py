@@ -167,7 +167,7 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
             image_scale=config.candidates.image_scale,
             chunk=RENDER_CHUNK,
             ensemble_size=config.uncertainty.ensemble_size,
-            num_draws=config.flow.draws,
+            num_draws=config.uncertainty.flow_draws,
         )
 
     @cache

@@ -92,16 +92,13 @@ def _make_field(config, scene: Scene, num_views: int, learned_variance: bool) ->
 
 def build_flow(config, scene: Scene) -> FlowField:
     """The distribution over fields that goes with a config's kind of field."""
-    options = {**config.flow}
-    for name in ("train_draws", "draws", "entropy_weight", "floor"):
-        del options[name]
+    common = {"contracted": scene.unbounded, **config.flow}
     if config.field_kind == "hash_grid":
-        grid = {**config.field}
-        del grid["appearance_features"]
-        return make_flow_field(scene.box, contracted=scene.unbounded, **grid, **options)
+        grid = {k: v for k, v in config.field.items() if k != "appearance_features"}
+        return make_flow_field(scene.box, **grid, **common)
     trunk = config[config.field_kind]
-    shape = {n: trunk[n] for n in ("depth", "width", "skip", "position_degree", "direction_degree")}
-    return make_flow_mlp_field(scene.box, contracted=scene.unbounded, **shape, **options)
+    shape = {k: trunk[k] for k in ("depth", "width", "skip", "position_degree", "direction_degree")}
+    return make_flow_mlp_field(scene.box, **shape, **common)
 
 
 def _pixel_radius(scene: Scene) -> float:

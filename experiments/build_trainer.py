@@ -51,13 +51,7 @@ def build_trainer(config, scene: Scene, num_views: int, kind: str) -> Trainer:
     if kind == FLOW:
         flow = build_flow(config, scene)
         field = mean_field(flow)
-        objective = make_flow_objective(
-            flow,
-            num_draws=config.flow.train_draws,
-            entropy_weight=config.flow.entropy_weight,
-            floor=config.flow.floor,
-            **rendering,
-        )
+        objective = make_flow_objective(flow, **rendering, **config.flow_training)
     elif kind == VARIANCE:
         objective = make_variance_objective(field, **rendering)
     else:

@@ -9,7 +9,6 @@ import pytest
 
 from bavs_jax.active import init_active_state
 from bavs_jax.candidates import captured_candidates, dataset_candidates, with_empty_views
-from bavs_jax.selection.policies import POLICIES
 from bavs_jax.training.batches import make_pixel_table
 from bavs_jax.training.checkpoints import Checkpoints
 from experiments.build import build_problem
@@ -38,7 +37,8 @@ def silent(total, description, unit):
     return track(total, description, unit, stream=io.StringIO())
 
 
-@pytest.mark.parametrize("policy", sorted(POLICIES))
+# One policy for each kind of source; all others differ from one of these by what is rendered.
+@pytest.mark.parametrize("policy", ["random", "bavs", "d_optimal", "coverage", "oracle"])
 def test_rounds_add_batches_of_pool_views_and_trace_nothing_new(problem, policy):
     state, initial = start(problem)
     step = problem.make_step(policy, initial, silent, policy)

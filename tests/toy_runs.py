@@ -24,8 +24,8 @@ OVERRIDES = {
     "train.capacity": 2048,
     "uncertainty.log2_cells": 3,
     "uncertainty.ensemble_size": 2,
-    "flow.train_draws": 2,
-    "flow.draws": 3,
+    "uncertainty.flow_draws": 3,
+    "flow_training.num_draws": 2,
 }
 
 
