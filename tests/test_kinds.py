@@ -11,8 +11,10 @@ import pytest
 from bavs_jax.active import init_active_state
 from bavs_jax.fields.hash_grid import make_hash_grid_field
 from bavs_jax.rendering.samplers import dense_samples
+from bavs_jax.training.batches import make_pixel_table
 from experiments.build import build_problem
 from experiments.build_scene import initial_views
+from experiments.build_trainer import KINDS, build_trainer
 from experiments.errors import ConfigError
 from experiments.progress import track
 from tests.toy_fields import rays_through
@@ -20,6 +22,7 @@ from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 from tests.traces import count_traces
 
+KEY = jax.random.key(0)
 TINY = {
     "nerf_mlp__depth": 2,
     "nerf_mlp__width": 16,
@@ -127,3 +130,17 @@ def test_views_without_training_are_read_with_the_mean_code():
     assert field.inputs(rays, samples) == {}
     given = field.inputs(rays, samples, jnp.array([3, 1]))["view_ids"]
     np.testing.assert_array_equal(given, [[3] * 5, [1] * 5])
+
+
+@pytest.mark.parametrize("field_kind", ["nerf_mlp", "mip_mlp"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_training_fits_every_network(field_kind, kind):
+    """Shapes alone: a step of training is traced, not compiled."""
+    scene = toy_scene()
+    config = toy_config(loader="blender", **TINY, field_kind=field_kind)
+    trainer = build_trainer(config, scene, scene.num_views, kind)
+    state = jax.eval_shape(trainer.init, KEY)
+    table = make_pixel_table(scene)
+    after, info = jax.eval_shape(trainer.call, KEY, state, table, np.ones(scene.num_views, bool))
+    assert jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, state)
+    assert info.loss.shape == ()

@@ -1,4 +1,4 @@
-"""ActiveNeRF on the paper's own network at its full size, with its field and with ours; for a GPU."""
+"""ActiveNeRF on the paper's own network at its full size, with its field or ours; for a GPU."""
 
 from experiments.configs.paper import blender_nerf
 
