@@ -12,6 +12,7 @@ import numpy as np
 
 from bavs_jax.cameras import take
 from bavs_jax.candidates import Candidates
+from bavs_jax.fields.deformation import vertices_in_box
 from bavs_jax.selection.information import Information, make_cached_curvature_fn
 from bavs_jax.selection.policy import Policy
 from bavs_jax.uncertainty.model import ModelFns, Situation, Toolbox
@@ -126,8 +127,12 @@ def make_candidate_curvature_fn(
 
     Eq 13 knows no colours, so a pose is enough. The sum runs over the pixels of a reduced image and
     is scaled up to the pixels that the photo would have; it is in the unit of the posterior's
-    precision, `(2 / R) jac_sq_sum` with the run's own R.
+    precision, `(2 / R) jac_sq_sum` with the run's own R, and 0 outside of what counts
+    (`LaplaceOptions.extent`).
     """
+    counts = 1.0
+    if toolbox.laplace.extent == "box":
+        counts = vertices_in_box(toolbox.grid)[:, None]
     small = reduced_cameras(candidates.cameras, image_scale)
     whole_rays = np.prod(np.asarray(candidates.cameras.sizes), axis=-1)
     small_rays = np.prod(np.asarray(small.sizes), axis=-1)
@@ -146,7 +151,7 @@ def make_candidate_curvature_fn(
             None,
             weighting=WEIGHTING,
         )
-        return 2.0 / situation.num_rays * float(whole_rays[index]) / num * added
+        return 2.0 / situation.num_rays * float(whole_rays[index]) / num * counts * added
 
     return curvature
 

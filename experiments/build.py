@@ -20,7 +20,7 @@ from bavs_jax.selection.policy import MODES
 from bavs_jax.sources import SourceOptions, make_sources_fn
 from bavs_jax.training.batches import PixelTable, make_pixel_table
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.channel import SCALES, VARIANTS, vertex_variance
+from bavs_jax.uncertainty.channel import EXTENTS, SCALES, VARIANTS, vertex_variance
 from bavs_jax.uncertainty.curvature import WEIGHTINGS
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, LaplaceOptions, Toolbox
 from bavs_jax.uncertainty.models import MODELS
@@ -70,6 +70,7 @@ def check_choices(config) -> None:
         ("uncertainty.weighting", options.weighting, WEIGHTINGS),
         ("uncertainty.variant", options.variant, VARIANTS),
         ("uncertainty.scale", options.scale, SCALES),
+        ("uncertainty.extent", options.extent, EXTENTS),
         ("candidates.source", config.candidates.source, ("dataset", "hemisphere")),
         ("candidates.mode", config.candidates.mode, ("", *MODES)),
     ):
@@ -108,6 +109,7 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
         capacity=8 * RENDER_CHUNK,
         variant=laplace.variant,
         scale=laplace.scale,
+        extent=laplace.extent,
     )
 
     def curvature(state: TrainState, table, view_ids, within, progress_fn=None):
@@ -245,6 +247,7 @@ def _laplace_options(config) -> LaplaceOptions:
         weighting=options.weighting,
         variant=options.variant,
         scale=options.scale,
+        extent=options.extent,
         max_rays=options.max_rays or None,
     )
 

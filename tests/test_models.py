@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bavs_jax.cameras import take
+from bavs_jax.candidates import Candidates
 from bavs_jax.sources import WEIGHTING, make_candidate_curvature_fn
 from bavs_jax.training.batches import view_pixel_rays
 from bavs_jax.training.losses import gaussian_nll
@@ -111,7 +112,9 @@ def test_a_candidate_adds_what_its_photo_would(trained):
     problem, situation = trained
     toolbox = problem.make_toolbox(silent)
     index = 3
-    curvature = make_candidate_curvature_fn(toolbox, situation, situation.candidates, 1.0)
+    cameras = situation.candidates
+    candidates = Candidates(cameras, np.arange(len(cameras)), np.ones(len(cameras), bool))
+    curvature = make_candidate_curvature_fn(toolbox, situation, candidates, 1.0)
     rays = int(problem.scene.offsets[1])
     views = np.full(rays, problem.scene.pool[index], np.int32)
     within = np.arange(rays, dtype=np.int32)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bavs_jax.fields.deformation import DeformationGrid, displace
+from bavs_jax.fields.deformation import DeformationGrid, displace, vertices_in_box
 from bavs_jax.uncertainty.channel import (
     finish_uncertainty,
     make_uncertainty_channel,
@@ -98,6 +98,32 @@ def test_log_scale_is_clipped_to_the_unit_interval():
     np.testing.assert_allclose(
         finish_uncertainty(rendered, scale="log"), [0.0, 0.0, 0.5, 1.0, 1.0], rtol=1e-6
     )
+
+
+@pytest.mark.parametrize("scale", ["log", "sigma"])
+def test_what_lies_outside_of_the_box_counts_like_nothing(scale):
+    grid = DeformationGrid(jnp.array([[-1.0] * 3, [1.0] * 3]), 2, contracted=True)
+    variance = jnp.full(grid.num_vertices, 4.0)
+    points = jnp.array([[0.9, 0.0, -0.9], [1.1, 0.0, 0.0], [0.0, 50.0, 0.0]])
+
+    def values(extent):
+        options = {"variant": "posterior", "scale": scale, "extent": extent}
+        channel = make_uncertainty_channel(grid, variance, **options)
+        return np.asarray(channel.value_fn(points, points)), channel.floor
+
+    everywhere, floor = values("space")
+    confined, _ = values("box")
+    assert (everywhere > floor).all()
+    np.testing.assert_array_equal(confined, [everywhere[0], floor, floor])
+
+
+def test_the_vertices_in_the_box_are_the_middle_half():
+    box = jnp.array([[-1.0] * 3, [1.0] * 3])
+    inside = vertices_in_box(DeformationGrid(box, 2, contracted=True)).reshape(5, 5, 5)
+    expected = np.zeros((5, 5, 5), bool)
+    expected[1:4, 1:4, 1:4] = True
+    np.testing.assert_array_equal(inside, expected)
+    assert vertices_in_box(DeformationGrid(box, 2)).all()
 
 
 def test_unknown_variant_and_scale_are_errors():

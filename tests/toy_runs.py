@@ -24,6 +24,7 @@ OVERRIDES = {
     "train.capacity": 2048,
     "uncertainty.log2_cells": 3,
     "uncertainty.ensemble_size": 2,
+    "flow.num_flows": 2,
     "uncertainty.flow_draws": 3,
     "flow_training.num_draws": 2,
 }

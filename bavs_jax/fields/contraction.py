@@ -33,6 +33,13 @@ def uncontract(y: jax.Array) -> jax.Array:
     return y / (norm * (2.0 - norm))
 
 
+def in_box(unit: jax.Array, *, contracted: bool) -> jax.Array:
+    """Which points of the unit cube [..., 3] lie in the box itself, not in what is around it."""
+    if not contracted:
+        return jnp.ones(unit.shape[:-1], bool)
+    return (jnp.abs(unit - 0.5) <= 0.25).all(-1)
+
+
 def unit_coordinates(box: jax.Array, positions: jax.Array, *, contracted: bool) -> jax.Array:
     """Positions [..., 3] in scene units as coordinates in [0, 1]^3.
 

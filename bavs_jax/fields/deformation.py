@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from bavs_jax.fields.contraction import unit_coordinates
+from bavs_jax.fields.contraction import in_box, unit_coordinates
 
 # The eight corners of a cell, [8, 3], z fastest.
 CORNERS = np.indices((2, 2, 2), np.int32).reshape(3, 8).T
@@ -40,6 +40,13 @@ class DeformationGrid:
 def grid_coordinates(grid: DeformationGrid, positions: jax.Array) -> jax.Array:
     """Positions [..., 3] in scene units, as cells `[0, 2^L]` (see `unit_coordinates`)."""
     return unit_coordinates(grid.box, positions, contracted=grid.contracted) * grid.cells
+
+
+def vertices_in_box(grid: DeformationGrid) -> jax.Array:
+    """Which vertices lie in the scene box, [G] bool: all of them where space is not contracted."""
+    side = np.arange(grid.cells + 1) / grid.cells
+    unit = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
+    return in_box(jnp.asarray(unit), contracted=grid.contracted)
 
 
 def vertex_number(grid: DeformationGrid, vertex: jax.Array) -> jax.Array:

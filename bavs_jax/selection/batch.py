@@ -164,7 +164,8 @@ def acquire(
         survivors, filter_info = _max_min_survivors(ctx, k, _as_radii(radii, ctx))
 
     choose = _choose_top_k if mode == "top_k" else _choose_greedily
-    selected, scores, selected_scores = choose(policy, key, ctx.replace(mask=survivors), k)
+    left = ctx.replace(mask=survivors)
+    selected, scores, selected_scores = choose(policy, key, left, k)
 
     ranks = _farthest_ranks(ctx, max(k, int(survivors.sum())))
     nearest = _nearest_fn(ctx.positions, ctx.training_positions, ctx.is_training_view)
@@ -176,7 +177,7 @@ def acquire(
         filter=filter_info,
         farthest_overlap=int((ranks[selected] < k).sum()),
         survivors_farthest_overlap=int((ranks[survivors] < survivors.sum()).sum()),
-        bound=None if policy.bound_fn is None else policy.bound_fn(ctx, selected),
+        bound=None if policy.bound_fn is None else policy.bound_fn(left, selected),
     )
 
 

@@ -67,20 +67,29 @@ def make_colour_objective(field: Field, *, background, capacity: int) -> Callabl
 
 
 def make_variance_objective(
-    field: Field, *, background, capacity: int, density_weight: float = 0.01
+    field: Field,
+    *,
+    background,
+    capacity: int,
+    density_weight: float = 0.01,
+    through_weights: bool = False,
 ) -> Callable:
     """Likelihood of the colours under the rendered variance (ActiveNeRF, Pan et al. 2022).
 
     `mean_rc (C - C*)^2 / (2 U) + mean_r log(U) / 2 + density_weight mean_i sigma_i`, with
     `U = sum_i w_i^2 beta_i + (1 - sum_i w_i)^2 0.01` of the field's `beta`.
 
-    Differs from ActiveNeRF: the background counts as one more sample, of the least variance a
-    sample can have. Without it U vanishes on rays that meet nothing, and they outweigh all others.
+    Differs from ActiveNeRF: U moves the variances alone, not the weights (`through_weights`). Fog
+    of n equal samples has an n-th of a wall's U, and where colours are known better than the least
+    variance, 0.01, likelihood prefers fog: lego from 20 views had 18 dB so, and 27 dB else. And the
+    background counts as one more sample, of the least variance a sample can have; without it U
+    vanishes on rays that meet nothing, and they outweigh all others.
 
     Args:
       field: one whose `apply` also returns `beta`.
       background, capacity: see `make_colour_objective`.
-      density_weight: of the mean density, which keeps empty space empty.
+      density_weight: of the mean density over all slots, which keeps empty space empty.
+      through_weights: whether the geometry is moved to make U likelier too, as published.
     """
     render = _render_batch(field, background, capacity)
 
@@ -88,11 +97,12 @@ def make_variance_objective(
         del key
         out = render(params, batch, samples)
         ray_weight = batch.ray_weight * out.ray_mask
-        variance = rendered_variance(out.weights, out.values["beta"])
-        variance = variance + jnp.square(1.0 - out.opacity) * MIN_VARIANCE
+        weights = out.weights if through_weights else jax.lax.stop_gradient(out.weights)
+        variance = rendered_variance(weights, out.values["beta"])
+        variance = variance + jnp.square(1.0 - weights.sum(-1)) * MIN_VARIANCE
         loss = gaussian_nll(out.rgb, batch.rgb, variance, ray_weight)
-        kept = samples.sample_mask & out.ray_mask[:, None]
-        density = weighted_mean(out.density, kept)
+        # Over all slots, the empty ones too: over the occupied alone it would thin out surfaces.
+        density = weighted_mean(out.density.mean(-1), ray_weight)
         return Outcome(loss + density_weight * density, out.rgb, out.weights, out.ray_mask)
 
     return objective

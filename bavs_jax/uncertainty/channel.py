@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from bavs_jax.fields.contraction import in_box, unit_coordinates
 from bavs_jax.fields.deformation import DeformationGrid, interpolate
 from bavs_jax.rendering.render import Channel
 from bavs_jax.uncertainty.posterior import (
@@ -14,6 +15,7 @@ from bavs_jax.uncertainty.posterior import (
 )
 
 VARIANTS = ("posterior", "bayesrays")
+EXTENTS = ("box", "space")
 SCALES = ("log", "sigma")
 LOG10_MIN, LOG10_MAX = -3.0, 6.0
 
@@ -53,9 +55,12 @@ def uncertainty_at(
 
 
 def make_uncertainty_channel(
-    grid: DeformationGrid, variance: jax.Array, *, variant: str, scale: str
+    grid: DeformationGrid, variance: jax.Array, *, variant: str, scale: str, extent: str = "box"
 ) -> Channel:
     """The channel to hand to the renderer.
+
+    What lies outside of the scene box counts like nothing at all (`extent`): sky and far hills,
+    which no photo can place, would else be more uncertain than anything that a view could settle.
 
     Args:
       grid: the deformation grid.
@@ -63,17 +68,26 @@ def make_uncertainty_channel(
       variant: one of `VARIANTS`.
       scale: `sigma` renders sigma over a floor of 0; `log` renders log10(sigma) over a floor
         of -3. Finish either with `finish_uncertainty`.
+      extent: `box`, or `space` for everything; they differ in unbounded scenes alone.
 
     Raises:
-      ValueError: unknown scale.
+      ValueError: unknown scale or extent.
     """
-    if scale == "sigma":
-        return Channel(lambda x, _: uncertainty_at(grid, variance, x, variant=variant), 0.0)
-    if scale == "log":
-        return Channel(
-            lambda x, _: jnp.log10(uncertainty_at(grid, variance, x, variant=variant)), LOG10_MIN
-        )
-    raise ValueError(f"scale: {scale!r} is unknown; use one of {', '.join(SCALES)}")
+    for name, value, known in (("scale", scale, SCALES), ("extent", extent, EXTENTS)):
+        if value not in known:
+            raise ValueError(f"{name}: {value!r} is unknown; use one of {', '.join(known)}")
+    floor = 0.0 if scale == "sigma" else LOG10_MIN
+
+    def value_fn(positions, directions):
+        del directions
+        sigma = uncertainty_at(grid, variance, positions, variant=variant)
+        value = sigma if scale == "sigma" else jnp.log10(sigma)
+        if extent == "space":
+            return value
+        unit = unit_coordinates(grid.box, positions, contracted=grid.contracted)
+        return jnp.where(in_box(unit, contracted=grid.contracted), value, floor)
+
+    return Channel(value_fn, floor)
 
 
 def finish_uncertainty(rendered: jax.Array, *, scale: str) -> jax.Array:

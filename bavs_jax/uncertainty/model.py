@@ -58,6 +58,7 @@ class LaplaceOptions(NamedTuple):
     weighting: str = "eq13"
     variant: str = "posterior"
     scale: str = "log"
+    extent: str = "box"
     max_rays: int | None = None  # in the curvature; a uniform subset stands for more
 
 

@@ -25,6 +25,7 @@ def make_render_chunk_fn(
     capacity: int,
     variant: str,
     scale: str,
+    extent: str = "box",
 ) -> Callable:
     """Makes the compiled rendering of a chunk of rays, uncertainty included (Fig 4).
 
@@ -38,7 +39,7 @@ def make_render_chunk_fn(
         channels = {}
         if variance is not None:
             channels["uncertainty"] = make_uncertainty_channel(
-                grid, variance, variant=variant, scale=scale
+                grid, variance, variant=variant, scale=scale, extent=extent
             )
         rendering, samples = render_pixels(
             field,

@@ -75,7 +75,7 @@ def get_config() -> ConfigDict:
     config.flow_training = ConfigDict()  # training/flow_loss.py
     config.flow_training.num_draws = 8  # in each step; 32 in its paper
     config.flow_training.entropy_weight = 0.01
-    config.flow_training.floor = 1e-5  # added to the kernels' width, colours in [0, 1]
+    config.flow_training.floor = 0.01  # added to the kernels' width; 1e-5 in its code
 
     # --- sampler_kind "coarse_to_fine" (rendering/coarse_to_fine.py); 64 and 128 in the paper ---
     config.coarse_to_fine = ConfigDict()
@@ -120,6 +120,7 @@ def get_config() -> ConfigDict:
     config.uncertainty.weighting = "eq13"  # "eq13", "eq11" or "empirical"
     config.uncertainty.variant = "posterior"  # "posterior" or "bayesrays"
     config.uncertainty.scale = "log"  # "log": log10 sigma on [0, 1]; "sigma"
+    config.uncertainty.extent = "box"  # what counts: the scene "box", or all "space" around it too
     config.uncertainty.flow_draws = 16  # of "cf_nerf" when rendering; 32 in its paper
     config.uncertainty.ensemble_size = 3  # fields, the run's own among them
     config.uncertainty.max_rays = 0  # training rays in the curvature; 0: all

@@ -88,6 +88,6 @@ def _choices(acquisition, index, candidates, training) -> tuple[Choice, ...]:
 def bound_words(bound: dict) -> str:
     """How far a batch can be from the best one, such as `gains 40 of at most 50 nats (80 %)`."""
     return (
-        f"the batch gains {bound['gain']:.4g} of at most {bound['bound']:.4g} nats that any batch "
-        f"of its size could ({bound['ratio']:.0%})"
+        f"the batch gains {bound['gain']:.4g} nats, and no batch of its size more than "
+        f"{bound['bound']:.4g} ({bound['ratio']:.0%} of that)"
     )

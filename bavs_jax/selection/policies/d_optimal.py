@@ -36,7 +36,7 @@ def make_informative(*, name, summary, gain) -> Policy:
 
 
 def bound(ctx, selected):
-    """Against the best batch of all candidates that were allowed, filtered or not."""
+    """Against the best batch of all that could be picked, which is what a filter has left."""
     return batch_upper_bound(require(ctx, "information"), selected, np.flatnonzero(ctx.mask))
 
 

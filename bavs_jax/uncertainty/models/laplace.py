@@ -39,6 +39,7 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
         capacity=toolbox.capacity,
         variant=options.variant,
         scale=options.scale,
+        extent=options.extent,
     )
 
     def fit(key, situation):
