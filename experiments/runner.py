@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import json
-import os
 import pathlib
 import platform
 import time
@@ -24,6 +23,7 @@ from experiments.build import Problem, run_key
 from experiments.build_scene import initial_views
 from experiments.evaluate import evaluate_views, picture_arrays, spread_evenly
 from experiments.files import append_line, write_arrays, write_json
+from experiments.machine import device_name, peak_memory_mb
 from experiments.progress import track
 from experiments.report.choices import bound_words
 
@@ -232,7 +232,8 @@ class Run:
             "config": self.config.to_dict(),
             "versions": {p: importlib.metadata.version(p) for p in PACKAGES}
             | {"python": platform.python_version()},
-            "device": _device_name(),
+            "device": device_name(),
+            "peak_memory_mb": peak_memory_mb(),
             "completed": completed,
             "lpips_reason": self.problem.lpips_reason,
             "baselines": self._baselines() if completed else None,
@@ -254,17 +255,6 @@ class Run:
 def _new_pending() -> dict:
     names = ("train", "curvature", "fit", "score", "select", "evaluate")
     return {"selected": [], "seconds": dict.fromkeys(names, 0.0)}
-
-
-def _device_name() -> str:
-    device = jax.devices()[0]
-    if device.platform != "cpu":
-        return f"{device.device_kind} x {jax.device_count()}"
-    return f"CPU, {platform.machine()}, {len(_cpu_affinity())} cores"
-
-
-def _cpu_affinity() -> set[int]:
-    return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else {*range(os.cpu_count())}
 
 
 def saved_part(problem: Problem, state: ActiveState):

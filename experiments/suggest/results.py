@@ -15,6 +15,7 @@ from bavs_jax.selection.route import route_length, shortest_route
 from bavs_jax.uncertainty.scoring import reduced_cameras
 from experiments.build import RENDER_CHUNK, Problem
 from experiments.files import write_json
+from experiments.machine import device_name, peak_memory_mb
 from experiments.progress import track
 from experiments.suggest import exports, page, plots
 from experiments.suggest.choosing import Suggestion, photo_rays
@@ -160,7 +161,6 @@ def write_results(
     )
     worth_words = page.worth_sentence(suggestion.worth, suggestion.photo_gain)
     foggy = photos_in_matter(scene, density_fn, around)
-    _write_summary(folder / "suggestion.json", suggestion, proposals, rows, facts, worth_words)
 
     cards_rows = [row | {"place": _place_words(pose)} for row, pose in zip(rows, poses)]
     cards, bar = page.preview_cards(images, cards_rows, [f.sentence() for f in facts])
@@ -194,6 +194,16 @@ def write_results(
         table=_table(rows, poses, facts),
         command=command,
         details=_details(problem, options, around, quality, foggy, seconds_fn()),
+    )
+    made = {
+        "scene": scene.name,
+        "command": command,
+        "device": device_name(),
+        "seconds": seconds_fn(),
+        "peak_memory_mb": peak_memory_mb(),
+    }
+    _write_summary(
+        folder / "suggestion.json", suggestion, proposals, rows, facts, worth_words, made
     )
     return files
 
@@ -290,10 +300,12 @@ def _details(problem, options, around: Surroundings, quality, foggy, seconds) ->
     ]
 
 
-def _write_summary(path, suggestion: Suggestion, proposals, rows, facts, worth_words) -> None:
+def _write_summary(
+    path, suggestion: Suggestion, proposals, rows, facts, worth_words, made: dict
+) -> None:
     worth, first = suggestion.worth, suggestion.worth.picked[0]
     left = [None if np.isnan(x) else float(x) for x in worth.best_left]
-    value = {
+    value = made | {
         "drawn": proposals.num_drawn,
         "kept": len(proposals.poses),
         "dropped": proposals.dropped,

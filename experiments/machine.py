@@ -1,0 +1,28 @@
+"""What a result was made on."""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+import sys
+
+import jax
+
+
+def device_name() -> str:
+    """The device that JAX uses, such as `CPU, x86_64, 2 cores`."""
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        return f"{device.device_kind} x {jax.device_count()}"
+    return f"CPU, {platform.machine()}, {len(_cpu_affinity())} cores"
+
+
+def _cpu_affinity() -> set[int]:
+    return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else {*range(os.cpu_count())}
+
+
+def peak_memory_mb() -> float:
+    """Most memory of the host that this process has held so far, in units of 10^6 bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
