@@ -21,6 +21,8 @@ from experiments.build_scene import initial_views, load_config_scene
 from experiments.progress import track
 from tests.toy_runs import toy_config
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 KEY = jax.random.key(5)
 every_model = pytest.mark.parametrize("name", MODELS)
 

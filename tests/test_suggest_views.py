@@ -170,9 +170,10 @@ def test_photos_see_what_is_before_them_and_not_behind_the_ball():
 
 
 def test_worth_in_words():
-    worth = Worth(np.array([60.0, 50.0]), np.array([60.0, 55.0, 45.0]))
+    worth = Worth(np.array([50.0, 30.0]), np.array([60.0, 55.0, 45.0]))
     words = page.worth_sentence(worth, 40.0)
-    assert "75% of what the first pick tells (60 nats)" in words and "would tell 67%" in words
+    assert "75% of what the best would have told before (60 nats)" in words
+    assert "would tell 67%" in words
     assert "less and less" in words
     assert "good place to stop" in page.worth_sentence(worth, 44.0)
     assert "still worth taking" in page.worth_sentence(worth, 10.0)
@@ -192,8 +193,7 @@ def written(tmp_path):
         distortion=np.tile([0.1, 0, 0, 0, 0, 0.02], (3, 1)), lens="opencv",
     )  # fmt: skip
     rows = [
-        {"order": i + 1, "picked": 3 - i, "score": 0.5, "share_of_first": 0.25 * i}
-        for i in range(3)
+        {"order": i + 1, "picked": 3 - i, "score": 0.5, "share_of_best": 0.25 * i} for i in range(3)
     ]
     exports.write_transforms(tmp_path / "transforms.json", poses, cameras, rows)
     exports.write_camera_path(tmp_path / "camera_path.json", poses, cameras)

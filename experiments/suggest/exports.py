@@ -17,7 +17,7 @@ SECONDS_PER_VIEW = 2.0
 FPS = 24
 CSV_COLUMNS = (
     *("order", "x", "y", "z", "qx", "qy", "qz", "qw", "look_x", "look_y", "look_z"),
-    *("score", "share_of_first", "picked"),
+    *("score", "share_of_best", "picked"),
 )
 # By our lens: nerfstudio's camera_model, and the camera_type of its camera paths.
 LENS_NAMES = {
@@ -35,7 +35,7 @@ def write_transforms(path: pathlib.Path, poses, cameras: Cameras, rows: list[dic
       path: the file.
       poses: [k, 4, 4] in the coordinates to write.
       cameras: [k] their lenses and image sizes.
-      rows: [k] what else is known of each: `order`, `picked`, `score`, `share_of_first`.
+      rows: [k] what else is known of each: `order`, `picked`, `score`, `share_of_best`.
     """
     frames = []
     for i, row in enumerate(rows):
@@ -85,7 +85,7 @@ def write_csv(path: pathlib.Path, poses, rows: list[dict]) -> None:
     writer.writerow(CSV_COLUMNS)
     for pose, row in zip(np.asarray(poses, float), rows):
         quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()  # x, y, z, w
-        numbers = [*pose[:3, 3], *quaternion, *-pose[:3, 2], row["score"], row["share_of_first"]]
+        numbers = [*pose[:3, 3], *quaternion, *-pose[:3, 2], row["score"], row["share_of_best"]]
         cells = ["" if n is None else f"{n:.9g}" for n in numbers]
         writer.writerow([row["order"], *cells, row["picked"]])
     write_atomic(path, lambda file: file.write(text.getvalue().encode()))

@@ -66,17 +66,17 @@ def worth_sentence(worth: Worth, photo_gain: float) -> str:
       worth: along the picks, nats.
       photo_gain: of one more photo from where there is one already, nats.
     """
-    num, first, left = len(worth.picked), worth.picked[0], worth.best_left[-1]
+    num, first, left = len(worth.picked), worth.best_left[0], worth.best_left[-1]
     if math.isnan(left):
         return f"No candidate is left after these {num}: draw more to see what else there is."
     words = (
         f"After {'this pose' if num == 1 else f'these {num}'}, the best candidate left would tell "
-        f"{left / first:.0%} of what the first pick tells ({first:.3g} nats)"
+        f"{left / first:.0%} of what the best would have told before ({first:.3g} nats)"
     )
     if first <= photo_gain:
         return words + (
-            f"; but even the first pick tells no more than another photo from where there is one "
-            f"already ({photo_gain:.3g} nats): the candidates hardly show anything new."
+            f"; but even that is no more than another photo from where there is one already would "
+            f"tell ({photo_gain:.3g} nats): the candidates hardly show anything new."
         )
     words += f"; another photo from where there is one already would tell {photo_gain / first:.0%}."
     excess = max(left - photo_gain, 0.0) / (first - photo_gain)

@@ -173,8 +173,8 @@ def _legend(figure: Figure, order: bool) -> None:
 
 
 def worth_plot(worth: Worth, photo_gain: float) -> str:
-    """What each pick and the best candidate left tell, as shares of what the first pick tells."""
-    first = float(worth.picked[0])
+    """What each pick and the best candidate left tell, as shares of the best one's at first."""
+    first = float(worth.best_left[0])
     figure = Figure(figsize=(6.4, 3.7), layout="constrained")
     axes = figure.add_subplot()
     num = len(worth.picked)
@@ -206,7 +206,9 @@ def worth_plot(worth: Worth, photo_gain: float) -> str:
         label="another photo from where there is one",
     )
     axes.set_xlabel("picks", fontsize=10, color="#374151")
-    axes.set_title("Information, as a share of the first pick's", fontsize=10.5, loc="left")
+    axes.set_title(
+        "Information, as a share of the best candidate's at first", fontsize=10.5, loc="left"
+    )
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.grid(axis="y", color="#e5e7eb", linewidth=0.8)

@@ -51,13 +51,13 @@ def visiting_order(places, options: Options, last_photo) -> tuple[np.ndarray, st
 
 def make_rows(suggestion: Suggestion, order) -> list[dict]:
     """What the files say of each pose, in their order."""
-    picked, first = suggestion.worth.picked, suggestion.worth.picked[0]
+    picked, first = suggestion.worth.picked, suggestion.worth.best_left[0]
     return [
         {
             "order": place + 1,
             "picked": int(pick) + 1,
             "score": float(suggestion.scores[suggestion.selected[pick]]),
-            "share_of_first": float(picked[pick] / first) if first > 0.0 else None,
+            "share_of_best": float(picked[pick] / first) if first > 0.0 else None,
         }
         for place, pick in enumerate(order)
     ]
@@ -262,7 +262,7 @@ def _place_words(pose: np.ndarray) -> str:
 
 
 def _table(rows, poses, facts) -> dict:
-    head = ("no.", "picked", "x", "y", "z", "score", "share of first", "high pixels")
+    head = ("no.", "picked", "x", "y", "z", "score", "information, of the best", "high pixels")
     head += ("nearest photo", "photos that see the place")
     cells = [
         [
@@ -270,7 +270,7 @@ def _table(rows, poses, facts) -> dict:
             str(row["picked"]),
             *(f"{x:.3f}" for x in pose[:3, 3]),
             f"{row['score']:.3f}",
-            "—" if row["share_of_first"] is None else f"{row['share_of_first']:.0%}",
+            "—" if row["share_of_best"] is None else f"{row['share_of_best']:.0%}",
             f"{fact.share_high:.0%}",
             f"{fact.nearest_distance:.3g}",
             str(fact.num_seeing),
@@ -303,13 +303,13 @@ def _details(problem, options, around: Surroundings, quality, foggy, seconds) ->
 def _write_summary(
     path, suggestion: Suggestion, proposals, rows, facts, worth_words, made: dict
 ) -> None:
-    worth, first = suggestion.worth, suggestion.worth.picked[0]
+    worth, first = suggestion.worth, suggestion.worth.best_left[0]
     left = [None if np.isnan(x) else float(x) for x in worth.best_left]
     value = made | {
         "drawn": proposals.num_drawn,
         "kept": len(proposals.poses),
         "dropped": proposals.dropped,
-        "first_gain": float(first),  # nats, as the next two
+        "best_gain": float(first),  # nats, as the next two
         "best_left": left,
         "photo_gain": suggestion.photo_gain,
         "worth": worth_words,
