@@ -10,7 +10,7 @@ def quick_compilation():
 
     Scripts that tests start, and all other modules, compile as users do.
     """
-    before = jax.config.jax_disable_most_optimizations
+    before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", before)

@@ -19,8 +19,6 @@ from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 from tests.traces import count_traces
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 @pytest.fixture(scope="module")
 def problem():

@@ -22,8 +22,6 @@ from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 from tests.traces import count_traces
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 KEY = jax.random.key(0)
 TINY = {
     "nerf_mlp__depth": 2,

@@ -267,6 +267,7 @@ def finished(tmp_path_factory):
     data = write_nerfstudio(base / "capture", width=48, height=32, fl_x=60.0, fl_y=62.0)
     flags = [f"--data={data}", f"--workdir={base / 'out'}", "--image_size=24", "--train_steps=16"]
     flags += ["--num_views=3", "--num_candidates=12", "--score_scale=0.5"]
+    flags += ["--config.field.num_levels=2", "--config.proposal.num_levels=1"]
     done = script(*flags, "--route", "--start=4,0,1", "--holdout=2", cache=base)
     assert done.returncode == 0, done.stderr
     return base, flags, done.stdout

@@ -33,8 +33,6 @@ from tests.oracles_unbounded import (
 )
 from tests.toy_fields import rays_through, smooth_field_fn
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], np.float32)
 
 
