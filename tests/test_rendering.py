@@ -16,6 +16,8 @@ from bavs_jax.rendering.sampling import make_march_options, march
 from tests.oracles_rendering import march_loop, render_loop, weights_loop
 from tests.toy_fields import rays_through, smooth_field_fn
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], np.float32)
 WHITE = jnp.ones(3)
 

@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 from scipy import stats as scipy_stats
 
-from experiments.report import ReportError, camera_map, choices, pictures, stats, write_report
+from experiments.report import (
+    ReportError,
+    camera_map,
+    choices,
+    gaps,
+    pictures,
+    stats,
+    write_report,
+)
 from experiments.report.headline import make_headline
 from experiments.report.results import load_runs
 from tests import report_files
@@ -97,7 +105,29 @@ def test_all_sections_are_there(full_page):
     assert "0.10.2" in words
     # 9 runs with 4 strips of 4 images, and 2 colour bars.
     assert full_page.count("<img ") == 9 * 4 * 4 + 2
-    assert full_page.count("<svg ") == 3 + 9 + 1  # PSNR, SSIM and depth; maps; timings
+    # PSNR, SSIM and depth; gaps; maps; timings.
+    assert full_page.count("<svg ") == 3 + 1 + 9 + 1
+
+
+def test_of_many_policies_the_few_that_matter_have_a_colour(tmp_path):
+    names = ["bavs", "random", "farthest", *(f"rival_{i}" for i in range(7))]
+    results = []
+    for place, name in enumerate(names):
+        for seed in (0, 1):
+            result = report_files.make_result(name, seed)
+            result["rounds"][-1]["psnr"] = 20.0 + place + 0.1 * seed
+            results.append(result)
+    runs = load_runs(report_files.write_workdir(tmp_path, results, arrays=False))
+    coloured = gaps.in_colour(runs, names, "bavs")
+    assert coloured == ["bavs", "random", "farthest", "rival_6", "rival_5"]
+    assert gaps.in_colour(runs, names[:7], "bavs") == names[:7]
+    num_views = stats.common_num_views(runs)
+    found = stats.paired_gaps(runs, "farthest", "random", "psnr", num_views)
+    np.testing.assert_allclose(found, [1.0, 1.0])
+    words = _words(_page(tmp_path))
+    assert (
+        "the means of the 5 other policies" in words and "more policies are in the table" in words
+    )
 
 
 # --- words -----------------------------------------------------------------------------------

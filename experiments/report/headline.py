@@ -8,6 +8,7 @@ from experiments.report import stats
 from experiments.report.results import Run
 
 REFERENCES = ("random", "farthest")  # what a policy must beat to be worth its time
+MOST_COMPARED = 6  # policies that the headline names
 SEED_SPREAD = (
     "One seed proves little: the spread between seeds is often half a dB, as large as most gains. "
     "Run at least 5 seeds before drawing a conclusion."
@@ -64,8 +65,11 @@ def make_headline(runs: list[Run], policies: list[str]) -> Headline:
         f"{reference} {decibels(comparison.reference.mean)}: {_gap_words(comparison.gap)}."
     )
     more = [
-        f"Against {p} ({decibels(c.reference.mean)}): {_gap_words(c.gap)}." for p, c in pairs[1:]
+        f"Against {p} ({decibels(c.reference.mean)}): {_gap_words(c.gap)}."
+        for p, c in pairs[1:MOST_COMPARED]
     ]
+    if len(pairs) > MOST_COMPARED:
+        more.append(f"{len(pairs) - MOST_COMPARED} more policies are in the table below.")
     saved = _saved_words(runs, focus, reference, num_views)
     return Headline(
         scene,

@@ -10,7 +10,7 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup
 
-from experiments.report import camera_map, choices, pictures, plots, stats, tables
+from experiments.report import camera_map, choices, gaps, pictures, plots, stats, tables
 from experiments.report.headline import focus_policy, make_headline
 from experiments.report.results import Run, load_acquisition, load_pictures, load_runs
 
@@ -51,12 +51,16 @@ def page_content(runs: list[Run]) -> dict:
     """Everything that the template names."""
     policies = _ordered_policies(runs)
     picture_sections, bars = _picture_sections(runs, policies)
-    qualities = [plots.quality_plot(runs, policies, measure) for measure in stats.MEASURES]
+    coloured = gaps.in_colour(runs, policies, focus_policy(policies))
+    qualities = [plots.quality_plot(runs, policies, m, coloured) for m in stats.MEASURES]
+    gap_svg = gaps.gap_plot(runs, policies, coloured)
     timing = plots.timing_plot(runs, policies)
     return {
         "title": runs[0].result["scene"]["name"] if runs else "no runs",
         "headline": make_headline(runs, policies),
-        "tiles": _tiles(runs, policies),
+        "tiles": _tiles(runs, coloured),
+        "num_grey": len(policies) - len(coloured),
+        "gaps": Markup(gap_svg) if gap_svg else None,
         "incomplete": [run.label for run in runs if not run.completed],
         "qualities": [Markup(svg) for svg in qualities if svg],
         "missing": _missing(runs),

@@ -28,7 +28,7 @@ PARTS = {
     "select": ("selecting", PURPLE),
     "evaluate": ("measuring on test views", SKY),
 }
-GREY = "#6b7280"
+GREY, PALE = "#6b7280", "#c3c8d0"
 
 
 def to_svg(figure: Figure, *, salt: str, label: str) -> str:
@@ -72,16 +72,25 @@ def policy_style(policies: list[str]) -> dict[str, tuple[str, str]]:
     }
 
 
-def quality_plot(runs: list[Run], policies: list[str], measure: stats.Measure) -> str | None:
-    """One measure against the number of training views, or None if no run has it."""
-    style = policy_style(policies)
+def quality_plot(
+    runs: list[Run], policies: list[str], measure: stats.Measure, coloured: list[str]
+) -> str | None:
+    """One measure against the number of training views, or None if no run has it.
+
+    Policies that are not in `coloured` are thin grey means without names.
+    """
+    style = policy_style(coloured)
     figure = Figure(figsize=(5.4, 3.7), layout="constrained")
     axes = figure.add_subplot()
     ends = []  # (last number of views, last value, policy) for the labels
     numbers = set()
     for policy in policies:
-        colour, marker = style[policy]
         mine = [run for run in runs if run.policy == policy]
+        if policy not in style:
+            curve = stats.mean_curve(runs, policy, measure.key)
+            axes.plot([n for n, _ in curve], [i.mean for _, i in curve], color=PALE, zorder=0.5)
+            continue
+        colour, marker = style[policy]
         for run in mine:
             points = _points(run, measure.key)
             if not points:
@@ -121,11 +130,19 @@ def quality_plot(runs: list[Run], policies: list[str], measure: stats.Measure) -
     axes.xaxis.set_major_locator(
         FixedLocator(sorted(numbers)) if len(numbers) <= 10 else MaxNLocator(8, integer=True)
     )
+    # By the runs themselves: bands over two or three seeds are so wide that nothing else shows.
+    axes.set_ylim(*_padded([v for run in runs for _, v in _points(run, measure.key)]))
     tidy(axes)
     _label_ends(axes, ends, {**style, **{f"{p} (incomplete)": s for p, s in style.items()}})
     return to_svg(
         figure, salt=f"quality-{measure.key}", label=f"{measure.label} against training views"
     )
+
+
+def _padded(values: list[float]) -> tuple[float, float]:
+    """Limits a little wider than all values."""
+    margin = 0.08 * (max(values) - min(values)) or 0.05 * abs(max(values)) or 1.0
+    return min(values) - margin, max(values) + margin
 
 
 def _points(run: Run, measure: str) -> list[tuple[int, float]]:

@@ -105,18 +105,29 @@ def compare(
     Returns:
       The comparison, or None where no seed has both.
     """
-    by_seed = [
-        {run.seed: run.value(measure, num_views) for run in completed(runs, name)}
-        for name in (policy, reference)
-    ]
-    pairs = [(value, by_seed[1].get(seed)) for seed, value in by_seed[0].items()]
-    pairs = [(a, b) for a, b in pairs if a is not None and b is not None]
+    pairs = _pairs(runs, policy, reference, measure, num_views)
     if not pairs:
         return None
     ours, theirs = zip(*pairs)
     return Comparison(
         mean_interval(ours), mean_interval(theirs), mean_interval(a - b for a, b in pairs)
     )
+
+
+def paired_gaps(
+    runs: list[Run], policy: str, reference: str, measure: str, num_views: int
+) -> list[float]:
+    """The differences that `compare` averages, one for each seed that both policies have."""
+    return [a - b for a, b in _pairs(runs, policy, reference, measure, num_views)]
+
+
+def _pairs(runs, policy, reference, measure, num_views) -> list[tuple[float, float]]:
+    by_seed = [
+        {run.seed: run.value(measure, num_views) for run in completed(runs, name)}
+        for name in (policy, reference)
+    ]
+    pairs = [(value, by_seed[1].get(seed)) for seed, value in by_seed[0].items()]
+    return [(a, b) for a, b in pairs if a is not None and b is not None]
 
 
 def mean_curve(runs: list[Run], policy: str, measure: str) -> list[tuple[int, Interval]]:
