@@ -28,6 +28,7 @@ PARTS = {
     "select": ("selecting", PURPLE),
     "evaluate": ("measuring on test views", SKY),
 }
+MIN_BAND = 3  # seeds; an interval over two is 13 standard errors wide and hides all else
 GREY, PALE = "#6b7280", "#c3c8d0"
 
 
@@ -103,7 +104,7 @@ def quality_plot(
         curve = stats.mean_curve(runs, policy, measure.key)
         if curve:
             x, means = [n for n, _ in curve], [i.mean for _, i in curve]
-            halves = [i.half or 0.0 for _, i in curve]
+            halves = [i.half if i.num >= MIN_BAND else 0.0 for _, i in curve]
             if any(halves):
                 low = [m - h for m, h in zip(means, halves)]
                 high = [m + h for m, h in zip(means, halves)]
