@@ -38,7 +38,7 @@ def silent(total, description, unit):
 
 
 # One policy for each kind of source; all others differ from one of these by what is rendered.
-@pytest.mark.parametrize("policy", ["random", "bavs", "d_optimal", "coverage", "oracle"])
+@pytest.mark.parametrize("policy", ["random", "bavs", "d_optimal", "oracle"])
 def test_rounds_add_batches_of_pool_views_and_trace_nothing_new(problem, policy):
     state, initial = start(problem)
     step = problem.make_step(policy, initial, silent, policy)

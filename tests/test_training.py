@@ -25,6 +25,8 @@ from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 from bavs_jax.uncertainty.streaming import make_curvature_fn, training_pixels
 from tests.toy_scenes import toy_scene
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 
 @pytest.fixture(scope="module")
 def trainer():
