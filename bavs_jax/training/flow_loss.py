@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from bavs_jax.numerics import safe_divide
+from bavs_jax.training.losses import weighted_mean
 
 
 def kernel_bandwidth(
@@ -82,7 +83,7 @@ def colour_likelihood_loss(
     """
     bandwidth = kernel_bandwidth(draws, exponent=exponent, floor=floor)
     log_density = kernel_log_density(draws, target, bandwidth)
-    return -safe_divide((log_density * ray_weight).sum(), ray_weight.sum())
+    return -weighted_mean(log_density, ray_weight)
 
 
 def mean_log_prob(log_prob: jax.Array, sample_mask: jax.Array) -> jax.Array:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from pathlib import Path
 
 import jinja2
 from markupsafe import Markup
 
+from experiments.files import write_atomic
 from experiments.report import camera_map, choices, gaps, pictures, plots, stats, tables
 from experiments.report.headline import focus_policy, make_headline
 from experiments.report.results import Run, load_acquisition, load_pictures, load_runs
@@ -43,7 +43,7 @@ def write_report(workdir: str | os.PathLike) -> Path:
     )
     page = environment.get_template("template.html").render(**page_content(runs))
     path = workdir / "report.html"
-    _write_atomically(path, page)
+    write_atomic(path, lambda file: file.write(page.encode()))
     return path
 
 
@@ -202,13 +202,3 @@ def _making(runs: list[Run]) -> dict:
         "versions": [(name, ", ".join(sorted(v))) for name, v in sorted(versions.items())],
         "configs": [{"text": text, "runs": "; ".join(who)} for text, who in configs.items()],
     }
-
-
-def _write_atomically(path: Path, text: str) -> None:
-    """A reader sees the old page or the new one, never half of it."""
-    with tempfile.NamedTemporaryFile(
-        "w", dir=path.parent, prefix=path.name, delete=False, encoding="utf-8"
-    ) as file:
-        file.write(text)
-    os.chmod(file.name, 0o644)  # temporary files start out private
-    os.replace(file.name, path)
