@@ -16,12 +16,11 @@ import time
 from absl import flags
 from ml_collections import config_flags
 
-from bavs_jax.scenes import SceneError
-from bavs_jax.selection.context import SelectionError
 from bavs_jax.selection.policies import POLICIES, get_policy
 from experiments import runtime, workdir
-from experiments.build import ConfigError, build_problem
+from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
+from experiments.errors import USER_ERRORS
 from experiments.report import write_report
 from experiments.runner import Run
 
@@ -77,10 +76,7 @@ def main() -> None:
     except OSError as error:
         # The config file is only read when it is first used.
         sys.exit(f"error: {' '.join(str(error).split())}")
-    except (
-        *(SceneError, SelectionError, ConfigError, workdir.WorkdirError),
-        FloatingPointError,
-    ) as error:
+    except USER_ERRORS as error:
         sys.exit(f"error: {error}")
 
 

@@ -45,7 +45,6 @@ class Problem(NamedTuple):
     init_train: Callable  # key -> TrainState
     make_step: Callable  # (policy name, initial views, track, label) -> an active step
     render: Callable  # (TrainState, jac_sq_sum or None, num_rays) -> (Rays [chunk] -> dict)
-    curvature: Callable  # (TrainState, table, view_ids, within, progress_fn) -> jac_sq_sum
     density: Callable  # (TrainState, positions [K, 3]) -> density [K], 0 where nothing is rendered
     make_toolbox: Callable  # track -> Toolbox
     model_fns: Callable  # (name of an uncertainty model, track) -> ModelFns
@@ -111,12 +110,6 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
         scale=laplace.scale,
         extent=laplace.extent,
     )
-
-    def curvature(state: TrainState, table, view_ids, within, progress_fn=None):
-        fn = curvature_fn(laplace.weighting)
-        return fn(
-            state.params, state.sampler_state, table, view_ids, within, progress_fn=progress_fn
-        )
 
     def render(state: TrainState, jac_sq_sum=None, num_rays: int = 0):
         if jac_sq_sum is None:
@@ -219,7 +212,6 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
         init_train=trainer.init,
         make_step=make_step,
         render=render,
-        curvature=curvature,
         density=density,
         make_toolbox=make_toolbox,
         model_fns=model_fns,

@@ -1,8 +1,27 @@
-"""What can be wrong with a config."""
+"""What can be wrong with what a user gives: each error is one line with the fix."""
+
+from bavs_jax.placement.collect import PlacementError
+from bavs_jax.scenes import SceneError
+from bavs_jax.selection.context import SelectionError
 
 
 class ConfigError(ValueError):
     """An option that cannot be used: one line that names it and the fix."""
+
+
+class WorkdirError(ValueError):
+    """A folder that cannot be used: one line that names the file, the field and the fix."""
+
+
+# What a script prints in place of a traceback; the last is a loss that is not finite.
+USER_ERRORS = (
+    SceneError,
+    SelectionError,
+    PlacementError,
+    ConfigError,
+    WorkdirError,
+    FloatingPointError,
+)
 
 
 def check_choice(name: str, value, known) -> None:

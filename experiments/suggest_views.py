@@ -16,11 +16,10 @@ import time
 from absl import flags
 from ml_collections import config_flags
 
-from bavs_jax.placement.collect import PlacementError
-from bavs_jax.scenes import SceneError, load_scene
-from bavs_jax.selection.context import SelectionError
+from bavs_jax.scenes import load_scene
 from experiments import runtime, workdir
-from experiments.build import ConfigError, build_problem
+from experiments.build import build_problem
+from experiments.errors import USER_ERRORS
 from experiments.suggest import choosing, places, results, settings, training
 
 FLAGS = flags.FLAGS
@@ -95,7 +94,7 @@ def suggest_views(data: pathlib.Path, folder: pathlib.Path, options: settings.Op
     problem = build_problem(config, scene)
     field_folder = folder / "field" / f"seed_{options.seed}"
     train = training.train_field(config, problem, field_folder, options.seed)
-    jac_sq_sum = training.photo_curvature(config, problem, train, field_folder, options.seed)
+    jac_sq_sum = training.photo_curvature(problem, train, field_folder, options.seed)
     quality = training.holdout_quality(problem, train)
 
     proposals = places.propose(
@@ -141,10 +140,7 @@ def main() -> None:
         runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
     try:
         suggest_views(pathlib.Path(FLAGS.data), pathlib.Path(FLAGS.workdir), read_options())
-    except (
-        *(SceneError, SelectionError, ConfigError, PlacementError, workdir.WorkdirError),
-        FloatingPointError,
-    ) as error:
+    except USER_ERRORS as error:
         sys.exit(f"error: {error}")
 
 

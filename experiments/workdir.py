@@ -5,15 +5,12 @@ from __future__ import annotations
 import json
 import pathlib
 
+from experiments.errors import WorkdirError
 from experiments.files import write_atomic, write_json
 
 SUMMARY_VERSION = 1
 # What may differ when a folder is taken up again: more policies or seeds add runs.
 EXTENSIBLE = ("policies", "seeds", "checkpoint_seconds", "data_dir", "num_pictures")
-
-
-class WorkdirError(ValueError):
-    """A folder that cannot be used: one line that names the file, the field and the fix."""
 
 
 def claim(workdir: pathlib.Path, config) -> None:

@@ -14,7 +14,8 @@ from bavs_jax.active import init_active_state
 from bavs_jax.scenes import Scene, SceneError
 from bavs_jax.training.checkpoints import Checkpoints
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.streaming import training_pixels
+from bavs_jax.uncertainty.model import Situation
+from bavs_jax.uncertainty.models.laplace import training_curvature
 from experiments.build import Problem, run_key
 from experiments.evaluate import evaluate_views, spread_evenly
 from experiments.files import write_arrays
@@ -68,22 +69,19 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
     return state.train
 
 
-def photo_curvature(config, problem: Problem, train: TrainState, folder: pathlib.Path, seed: int):
-    """`jac_sq_sum` [G, 3] of all training photos (Eq 13), kept in `folder` once it is made."""
+def photo_curvature(problem: Problem, train: TrainState, folder: pathlib.Path, seed: int):
+    """`jac_sq_sum` [G, 3] of all training photos, kept in `folder` once it is made."""
     path = folder / "curvature.npz"
     if path.exists():
         with np.load(path) as data:
             return jnp.asarray(data["jac_sq_sum"])
     is_training = np.zeros(len(problem.table.cameras), bool)
     is_training[problem.scene.pool] = True
-    view_ids, within = training_pixels(problem.table, is_training)
-    scale, most = 1.0, config.uncertainty.max_rays
-    if most and len(view_ids) > most:
-        rows = np.sort(np.random.default_rng(seed).permutation(len(view_ids))[:most])
-        scale = len(view_ids) / most
-        view_ids, within = view_ids[rows], within[rows]
-    with track(len(view_ids), "curvature of the photos", "rays") as bar:
-        jac_sq_sum = scale * problem.curvature(train, problem.table, view_ids, within, bar.advance)
+    toolbox = problem.make_toolbox(track)
+    situation = Situation(train, problem.table, is_training, num_rays=0, label="photos")
+    jac_sq_sum = training_curvature(
+        run_key(seed), toolbox, situation, weighting=toolbox.laplace.weighting
+    )
     write_arrays(path, jac_sq_sum=np.asarray(jac_sq_sum))
     return jac_sq_sum
 
