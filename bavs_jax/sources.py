@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from bavs_jax.cameras import take
+from bavs_jax.cameras import Cameras, take
 from bavs_jax.candidates import Candidates
 from bavs_jax.fields.deformation import vertices_in_box
 from bavs_jax.selection.information import Information, make_cached_curvature_fn
@@ -91,14 +91,19 @@ def make_sources_fn(
                 prior_weight=toolbox.laplace.prior_weight,
                 weighting=WEIGHTING,
             )
-        dense = make_candidate_curvature_fn(toolbox, situation, candidates, options.image_scale)
+        dense = make_candidate_curvature_fn(
+            toolbox, situation, candidates.cameras, options.image_scale
+        )
 
-        def timed(index):
+        def timed(indices):
             with _clock(seconds, "score"):
-                return dense(index)
+                return jax.block_until_ready(dense(indices))
 
         curvature_fn = make_cached_curvature_fn(
-            timed, num_vertices=toolbox.grid.num_vertices, max_bytes=options.cache_bytes
+            timed,
+            num_vertices=toolbox.grid.num_vertices,
+            max_bytes=options.cache_bytes,
+            group_size=toolbox.group_size,
         )
         return Information(precision, curvature_fn)
 
@@ -121,37 +126,42 @@ def make_sources_fn(
 
 
 def make_candidate_curvature_fn(
-    toolbox: Toolbox, situation: Situation, candidates: Candidates, image_scale: float
+    toolbox: Toolbox, situation: Situation, cameras: Cameras, image_scale: float
 ) -> Callable:
-    """Makes `curvature(index) -> [G, 3]`: what a candidate's photo would add to the precision.
+    """Makes `curvature(indices [n]) -> [n, G, 3]`: what photos would add to the precision.
 
     Eq 13 knows no colours, so a pose is enough. The sum runs over the pixels of a reduced image and
     is scaled up to the pixels that the photo would have; it is in the unit of the posterior's
     precision, `(2 / R) jac_sq_sum` with the run's own R, and 0 outside of what counts
-    (`LaplaceOptions.extent`).
+    (`LaplaceOptions.extent`). Rays of all n cameras share compiled calls; n is at most
+    `toolbox.group_size`.
     """
     counts = 1.0
     if toolbox.laplace.extent == "box":
         counts = vertices_in_box(toolbox.grid)[:, None]
-    small = reduced_cameras(candidates.cameras, image_scale)
-    whole_rays = np.prod(np.asarray(candidates.cameras.sizes), axis=-1)
+    small = reduced_cameras(cameras, image_scale)
+    whole_rays = np.prod(np.asarray(cameras.sizes), axis=-1)
     small_rays = np.prod(np.asarray(small.sizes), axis=-1)
     table = situation.table
+    most = toolbox.group_size
 
-    def curvature(index):
-        # The candidate stands in for view 0, so that all arrays keep the table's shapes and nothing
-        # is compiled anew; its pixels are not looked at.
-        stand_in = jax.tree.map(lambda x, y: x.at[0].set(y[index]), table.cameras, small)
-        num = int(small_rays[index])
+    def curvature(indices):
+        # The cameras stand in for the first views, so that all arrays keep the table's shapes and
+        # nothing is compiled anew; their pixels are not looked at.
+        places, sources = np.arange(len(indices)), np.resize(indices, most)
+        stand_in = jax.tree.map(lambda x, y: x.at[:most].set(y[sources]), table.cameras, small)
+        num_rays = small_rays[indices]
         added = toolbox.curvature(
             situation.train,
             table.replace(cameras=stand_in),
-            np.zeros(num, np.int32),
-            np.arange(num, dtype=np.int32),
+            np.repeat(places, num_rays).astype(np.int32),
+            np.concatenate([np.arange(num, dtype=np.int32) for num in num_rays]),
             None,
             weighting=WEIGHTING,
+            by_view=True,
         )
-        return 2.0 / situation.num_rays * float(whole_rays[index]) / num * counts * added
+        scale = 2.0 / situation.num_rays * whole_rays[indices] / num_rays
+        return counts * scale.astype(np.float32)[:, None, None] * added[: len(indices)]
 
     return curvature
 

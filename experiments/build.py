@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from functools import cache, partial
 from typing import NamedTuple
@@ -26,7 +27,7 @@ from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, LaplaceOptions, Too
 from bavs_jax.uncertainty.models import MODELS
 from bavs_jax.uncertainty.posterior import default_prior_weight
 from bavs_jax.uncertainty.scoring import make_render_chunk_fn
-from bavs_jax.uncertainty.streaming import make_curvature_fn
+from bavs_jax.uncertainty.streaming import curvature_group_size, make_curvature_fn
 from bavs_jax.uncertainty.true_error import make_true_error_fn
 from experiments.build_field import field_background
 from experiments.build_scene import make_source
@@ -95,6 +96,7 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
     field, sampler = trainer.field, trainer.sampler
     background = field_background(scene)
     laplace, grid = _laplace_options(config), _deformation_grid(config, scene)
+    group_size = curvature_group_size(grid.num_vertices, len(table.cameras))
 
     @cache
     def curvature_fn(weighting: str):
@@ -139,12 +141,16 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
         return fresh.replace(params=state.params, sampler_state=state.sampler_state)
 
     def make_toolbox(track: Callable) -> Toolbox:
-        def tracked_curvature(state, table, view_ids, within, label, *, weighting):
-            fn = partial(curvature_fn(weighting), state.params, state.sampler_state, table)
-            if label is None:
-                return fn(view_ids, within)
-            with track(len(view_ids), label, "rays") as task:
-                return fn(view_ids, within, progress_fn=task.advance)
+        def tracked_curvature(state, table, view_ids, within, label, *, weighting, by_view=False):
+            quiet = contextlib.nullcontext(None)
+            with quiet if label is None else track(len(view_ids), label, "rays") as task:
+                sums = curvature_fn(weighting)(
+                    *(state.params, state.sampler_state, table, view_ids, within),
+                    progress_fn=task and task.advance,
+                    group_ids=view_ids if by_view else None,
+                    num_groups=group_size,  # in both cases, so that they share compilations
+                )
+            return sums if by_view else sums[0]
 
         def train(kind, key, situation):
             return train_aside(config, trainers[kind], key, situation, kind, track)
@@ -157,6 +163,7 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
             capacity=8 * RENDER_CHUNK,
             grid=grid,
             laplace=laplace,
+            group_size=group_size,
             curvature=tracked_curvature,
             train=train,
             image_scale=config.candidates.image_scale,

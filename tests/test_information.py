@@ -45,7 +45,7 @@ def toy(seed, *, overlap=0.5):
 
 def information_of(precision, curvatures):
     fn = make_cached_curvature_fn(
-        lambda index: curvatures[index], num_vertices=len(precision), max_bytes=2**20
+        lambda indices: curvatures[indices], num_vertices=len(precision), max_bytes=2**20
     )
     return Information(jnp.asarray(precision), fn)
 
@@ -92,22 +92,40 @@ def test_rounding_below_zero_is_clipped_and_nan_is_kept():
 def test_memory_is_bounded_and_what_does_not_fit_is_computed_anew():
     calls = []
 
-    def dense(index):
-        calls.append(index)
-        return np.full((NUM_VERTICES, 3), index, np.float32)
+    def dense(indices):
+        calls.append(indices.tolist())
+        return np.ones((len(indices), NUM_VERTICES, 3)) * indices[:, None, None]
 
     one = MIN_ROWS * 16  # bytes of a padded candidate: four numbers of 4 bytes a row
-    fn = make_cached_curvature_fn(dense, num_vertices=NUM_VERTICES, max_bytes=2 * one + one // 2)
-    for _ in range(3):
-        for index in (1, 2, 3):
-            assert fn(index)[1].max() == index
-    assert calls == [1, 2, 3, 3, 3]
+    fn = make_cached_curvature_fn(
+        dense, num_vertices=NUM_VERTICES, max_bytes=4 * one + one // 2, group_size=2
+    )
+    wanted = [7, 1, 5, 2, 3, 9, 4]
+    for _ in range(2):
+        assert [h.max() for _, h in fn(wanted)] == wanted
+    assert [h.max() for _, h in fn([3, 1])] == [3, 1]
+    assert calls == [[7, 1], [5, 2], [3, 9], [4], [3, 9], [4], [3]]
+
+
+def test_curvature_is_made_only_as_far_as_it_is_asked_for():
+    calls = []
+
+    def dense(indices):
+        calls.append(indices.tolist())
+        return np.ones((len(indices), NUM_VERTICES, 3))
+
+    fn = make_cached_curvature_fn(dense, num_vertices=NUM_VERTICES, max_bytes=0, group_size=3)
+    next(fn([4, 6, 8, 1, 3]))
+    assert calls == [[4, 6, 8]]
 
 
 def test_a_wrong_shape_is_an_error():
-    fn = make_cached_curvature_fn(lambda i: np.zeros(12), num_vertices=12, max_bytes=0)
-    with pytest.raises(SelectionError, match=r"shape \(12,\) for candidate 4; return \(12, 3\)"):
-        fn(4)
+    fn = make_cached_curvature_fn(
+        lambda i: np.zeros(12), num_vertices=12, max_bytes=0, group_size=2
+    )
+    message = r"shape \(12,\) for candidates \[4, 2\]; return \(2, 12, 3\)"
+    with pytest.raises(SelectionError, match=message):
+        list(fn([4, 2]))
 
 
 # --- gains -----------------------------------------------------------------------------------
@@ -222,9 +240,10 @@ def test_only_what_may_be_picked_is_differentiated(name, mode, distance_filter):
     precision, curvatures = toy(4)
     asked = set()
 
-    def curvature_fn(index):
-        asked.add(int(index))
-        return sparse_curvature(curvatures[index])
+    def curvature_fn(indices):
+        for index in indices:
+            asked.add(int(index))
+            yield sparse_curvature(curvatures[index])
 
     mask = np.arange(NUM) != 5
     ctx = context(Information(precision, curvature_fn), mask=mask)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from bavs_jax.cameras import take
-from bavs_jax.candidates import Candidates
 from bavs_jax.sources import WEIGHTING, make_candidate_curvature_fn
 from bavs_jax.training.batches import view_pixel_rays
 from bavs_jax.training.losses import gaussian_nll
@@ -110,23 +109,21 @@ def test_only_coverage_can_be_conditioned_on_picks_and_falls_with_them(trained, 
     assert 0.0 < after < 0.9 * before
 
 
-def test_a_candidate_adds_what_its_photo_would(trained):
+def test_candidates_add_what_their_photos_would(trained):
     problem, situation = trained
     toolbox = problem.make_toolbox(silent)
-    index = 3
-    cameras = situation.candidates
-    candidates = Candidates(cameras, np.arange(len(cameras)), np.ones(len(cameras), bool))
-    curvature = make_candidate_curvature_fn(toolbox, situation, candidates, 1.0)
+    curvature = make_candidate_curvature_fn(toolbox, situation, situation.candidates, 1.0)
     rays = int(problem.scene.offsets[1])
-    views = np.full(rays, problem.scene.pool[index], np.int32)
     within = np.arange(rays, dtype=np.int32)
-    jac_sq_sum = toolbox.curvature(
-        situation.train, situation.table, views, within, None, weighting=WEIGHTING
-    )
-    expected = 2.0 / situation.num_rays * np.asarray(jac_sq_sum)
-    assert expected.max() > 0
-    # Sums of float32 in another order of rays.
-    np.testing.assert_allclose(curvature(index), expected, rtol=1e-4, atol=1e-6 * expected.max())
+    for index, added in zip((3, 1), curvature(np.array([3, 1]))):
+        views = np.full(rays, problem.scene.pool[index], np.int32)
+        jac_sq_sum = toolbox.curvature(
+            situation.train, situation.table, views, within, None, weighting=WEIGHTING
+        )
+        expected = 2.0 / situation.num_rays * np.asarray(jac_sq_sum)
+        assert expected.max() > 0
+        # Sums of float32 in another order of rays.
+        np.testing.assert_allclose(added, expected, rtol=1e-4, atol=1e-6 * expected.max())
 
 
 def test_true_error_of_a_constant_render(trained):

@@ -36,9 +36,12 @@ def information_sources(view_ids, *, ties):
     """Stands in for the curvature of the renders: a sparse one that depends on the view alone."""
     num_vertices = 40
 
-    def dense(index):
+    def one(index):
         rng = np.random.default_rng(0 if ties else int(view_ids[index]))
         return rng.exponential(size=(num_vertices, 3)) * (rng.uniform(size=(num_vertices, 1)) < 0.3)
+
+    def dense(indices):
+        return np.stack([one(index) for index in indices])
 
     curvature_fn = make_cached_curvature_fn(dense, num_vertices=num_vertices, max_bytes=2**20)
     return {"information": Information(np.full((num_vertices, 3), 0.1, np.float32), curvature_fn)}

@@ -162,8 +162,16 @@ def test_streamed_curvature_equals_one_dense_call_for_any_bucket(trainer):
         done = []
         got = curvature(params, occupancy, table, view_ids, within, progress_fn=done.append)
         # Another order of the same float32 sums.
-        np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5 * float(want.max()))
+        np.testing.assert_allclose(got[0], want, rtol=1e-4, atol=1e-5 * float(want.max()))
         assert sum(done) == len(view_ids)
+
+    # A sum for each group of rays.
+    apart = curvature(
+        params, occupancy, table, view_ids, within, group_ids=2 * view_ids, num_groups=3
+    )
+    assert got.shape == (1, *want.shape) and apart.shape == (3, *want.shape)
+    assert float(apart[0].max()) > 0 and float(apart[2].max()) > 0 and not apart[1].any()
+    np.testing.assert_allclose(apart.sum(0), want, rtol=1e-4, atol=1e-5 * float(want.max()))
 
 
 def test_checkpoint_round_trip_keeps_the_newest(trainer, tmp_path):

@@ -25,8 +25,8 @@ class Information(NamedTuple):
     """What is known about the field, and what each candidate would add."""
 
     precision: jax.Array  # [G, 3] H > 0, the prior and all picks so far included
-    # index -> (rows [n] int32, h [n, 3] >= 0): curvature that candidate `index` adds at vertices
-    # `rows` of the grid; n is a power of two, filled up with rows = 0, h = 0.
+    # Candidate indices -> one (rows [n] int32, h [n, 3] >= 0) after another: the curvature that
+    # each adds at vertices `rows` of the grid; n is a power of two, filled up with rows = 0, h = 0.
     curvature_fn: Callable
 
 
@@ -62,41 +62,52 @@ def sparse_curvature(h) -> tuple[np.ndarray, np.ndarray]:
 
 
 def make_cached_curvature_fn(
-    dense_fn: Callable, *, num_vertices: int, max_bytes: int = DEFAULT_MAX_BYTES
+    dense_fn: Callable,
+    *,
+    num_vertices: int,
+    max_bytes: int = DEFAULT_MAX_BYTES,
+    group_size: int = 1,
 ) -> Callable:
     """Makes an `Information.curvature_fn` that remembers as many candidates as fit.
 
     A greedy batch asks for all candidates once for each pick, in the same order: to forget the
     oldest would mean to forget each one just before it is wanted. Hence what came first is kept,
-    and what no longer fits is computed anew each time.
+    and what no longer fits is computed anew each time, a few candidates at once.
 
     Args:
-      dense_fn: candidate index -> h [G, 3], what the candidate adds to H.
+      dense_fn: candidate indices [n] -> h [n, G, 3], what each candidate adds to H.
       num_vertices: G.
       max_bytes: of host memory that remembered curvature may take.
+      group_size: most candidates that `dense_fn` is asked for at once.
 
     Returns:
-      `curvature_fn(index) -> (rows [n], h [n, 3])`; it raises SelectionError where `dense_fn`
-      returns another shape than [G, 3].
+      `curvature_fn(indices)`, a generator of `(rows [n], h [n, 3])` in the order of the indices; it
+      raises SelectionError where `dense_fn` returns another shape than [n, G, 3].
     """
     kept, room = {}, max_bytes
 
-    def curvature_fn(index):
+    def look_at(indices) -> dict:
         nonlocal room
-        index = int(index)
-        if index in kept:
-            return kept[index]
-        h = np.asarray(dense_fn(index))
-        if h.shape != (num_vertices, 3):
+        h = np.asarray(dense_fn(np.array(indices)))
+        if h.shape != (len(indices), num_vertices, 3):
             raise SelectionError(
-                f"curvature: shape {h.shape} for candidate {index}; return {(num_vertices, 3)}"
+                f"curvature: shape {h.shape} for candidates {indices}; "
+                f"return {(len(indices), num_vertices, 3)}"
             )
-        rows, values = sparse_curvature(h)
-        size = rows.nbytes + values.nbytes
-        if size <= room:
-            room -= size
-            kept[index] = rows, values
-        return rows, values
+        fresh = {index: sparse_curvature(dense) for index, dense in zip(indices, h)}
+        for index, (rows, values) in fresh.items():
+            if rows.nbytes + values.nbytes <= room:
+                room -= rows.nbytes + values.nbytes
+                kept[index] = rows, values
+        return fresh
+
+    def curvature_fn(indices):
+        indices, fresh = [int(index) for index in indices], {}
+        for place, index in enumerate(indices):
+            if index not in kept and index not in fresh:
+                unknown = dict.fromkeys(i for i in indices[place:] if i not in kept)
+                fresh = look_at(list(unknown)[:group_size])
+            yield kept[index] if index in kept else fresh[index]
 
     return curvature_fn
 
@@ -151,16 +162,16 @@ def candidate_gains(information: Information, indices, *, gain: Callable) -> np.
       [n] float32 >= 0.
     """
     gains = [
-        float(_gain_at(information.precision, *information.curvature_fn(index), gain=gain))
-        for index in indices
+        float(_gain_at(information.precision, rows, h, gain=gain))
+        for rows, h in information.curvature_fn(indices)
     ]
     return np.array(gains, np.float32)
 
 
 def add_curvature(information: Information, index: int) -> Information:
     """What is known once candidate `index` has been taken: its h joins H."""
-    precision = _add_at(information.precision, *information.curvature_fn(index))
-    return information._replace(precision=precision)
+    ((rows, h),) = information.curvature_fn([index])
+    return information._replace(precision=_add_at(information.precision, rows, h))
 
 
 # --- how good a batch is ---------------------------------------------------------------------

@@ -166,6 +166,7 @@ def add_jac_sq_sum(
     background,
     target: jax.Array | None = None,
     ray_weight: jax.Array | None = None,
+    first_row: jax.Array | None = None,
     weighting: str = "eq13",
     inputs: dict | None = None,
     jacobian_fn: Callable = split_colour_jacobian,
@@ -173,16 +174,17 @@ def add_jac_sq_sum(
     """Adds R rays to the raw sum of squared Jacobians (Eqs 11-13).
 
     Args:
-      jac_sq_sum: [G, 3] the sum so far.
+      jac_sq_sum: [G, 3] the sum so far; or several of them, one after another, [N G, 3].
       field_fn, rays, samples, background, inputs: see `colour_jacobian`.
       grid: the deformation grid of G vertices.
       target: [R, 3] true colours; needed by `eq11` and `empirical`.
       ray_weight: [R] factor of each ray's contribution, 0 for padding; 1 when None.
+      first_row: [R] int, a multiple of G: where the sum of each ray begins; 0 when None.
       weighting: one of `WEIGHTINGS`.
       jacobian_fn: `split_colour_jacobian`, or `colour_jacobian` which it equals.
 
     Returns:
-      [G, 3] the new sum.
+      The new sum, of the same shape.
     """
     jacobian, rgb = jacobian_fn(field_fn, rays, samples, background=background, inputs=inputs)
     residual = None if target is None else rgb - target
@@ -191,4 +193,6 @@ def add_jac_sq_sum(
     rows, added = jax.vmap(vertex_squares, in_axes=(None, 0, 0))(grid, positions, jacobian)
     if ray_weight is not None:
         added = added * ray_weight[:, None, None, None]
+    if first_row is not None:
+        rows = rows + first_row[:, None, None]
     return jac_sq_sum.at[rows.reshape(-1)].add(added.reshape(-1, 3))

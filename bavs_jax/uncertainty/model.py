@@ -65,8 +65,9 @@ class LaplaceOptions(NamedTuple):
 class Toolbox(NamedTuple):
     """What a model may use for one scene.
 
-    `curvature(train_state, table, view_ids [N], within [N], label, *, weighting) -> [G, 3]`, the
-      `jac_sq_sum`; shows progress where `label` is not None.
+    `curvature(train_state, table, view_ids [N], within [N], label, *, weighting, by_view=False) ->
+      [G, 3]`, the `jac_sq_sum`; if `by_view`, of each of the first `group_size` views by itself,
+      [group_size, G, 3]. Shows progress where `label` is not None.
     `train(kind, key, situation) -> TrainState` trains a field of any kind, from a start of its own,
       on the views of the situation.
     """
@@ -78,6 +79,7 @@ class Toolbox(NamedTuple):
     capacity: int  # places of the buffer in which samples are evaluated when rendering
     grid: DeformationGrid
     laplace: LaplaceOptions
+    group_size: int  # views whose curvatures are made at once, each a dense [G, 3]
     curvature: Callable
     train: Callable
     image_scale: float = 0.25  # of width and height, for renders of whole views

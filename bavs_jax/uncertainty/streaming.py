@@ -16,6 +16,9 @@ from bavs_jax.rendering.sampling import first_slots
 from bavs_jax.training.batches import PixelTable, pixel_colours, view_pixel_rays
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 
+# Views whose curvatures are made at once, and the most memory that they may take.
+MAX_GROUP, MAX_GROUP_BYTES = 8, 2**26
+
 
 def training_pixels(table: PixelTable, is_training_view) -> tuple[np.ndarray, np.ndarray]:
     """All pixels of the training views that are not masked: view ids [N] and row numbers [N]."""
@@ -30,6 +33,12 @@ def training_pixels(table: PixelTable, is_training_view) -> tuple[np.ndarray, np
     return view_ids, within
 
 
+def curvature_group_size(num_vertices: int, num_views: int) -> int:
+    """How many views' curvatures [G, 3] to make at once: few enough for `MAX_GROUP_BYTES`."""
+    fitting = MAX_GROUP_BYTES // (num_vertices * 3 * 4)
+    return max(1, min(MAX_GROUP, fitting, num_views))
+
+
 def make_curvature_fn(
     field: Field,
     sampler: Sampler,
@@ -37,7 +46,7 @@ def make_curvature_fn(
     *,
     background,
     weighting: str = "eq13",
-    buckets: tuple[int, ...] = (16, 32, 64),
+    buckets: tuple[int, ...] = (8, 16, 32, 64),
     chunk_samples: int = 8192,
 ) -> Callable:
     """Makes the streamed raw Jacobian sum (Eqs 10-13) over given pixels.
@@ -56,8 +65,10 @@ def make_curvature_fn(
       chunk_samples: slots of one compiled call.
 
     Returns:
-      `curvature(params, sampler_state, table, view_ids [N], within [N], progress_fn=None)` ->
-      `jac_sq_sum` [G, 3]. `progress_fn(n)` is called with the number of rays done.
+      `curvature(params, sampler_state, table, view_ids [N], within [N], progress_fn=None, *,
+      group_ids=None, num_groups=1) -> jac_sq_sum [num_groups, G, 3]`, a sum for each group of
+      rays; `group_ids` [N] int says which ray is of which, by default all are of group 0.
+      `progress_fn(n)` is called with the number of rays done.
     """
     slots = sampler.num_slots
     buckets = () if sampler.dense else buckets
@@ -72,7 +83,9 @@ def make_curvature_fn(
         return samples.sample_mask.sum(-1)
 
     @partial(jax.jit, static_argnames="bucket", donate_argnums=0)
-    def add_chunk(total, params, sampler_state, table, view_ids, within, ray_weight, *, bucket):
+    def add_chunk(
+        total, params, sampler_state, table, view_ids, within, group_ids, ray_weight, *, bucket
+    ):
         rays = view_pixel_rays(table.cameras, view_ids, within)
         samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
         samples = first_slots(samples, bucket)
@@ -85,6 +98,7 @@ def make_curvature_fn(
             background=background,
             target=None if weighting == "eq13" else pixel_colours(table, view_ids, within),
             ray_weight=ray_weight,
+            first_row=group_ids * grid.num_vertices,
             weighting=weighting,
             inputs=field.inputs(rays, samples, view_ids),
         )
@@ -98,8 +112,20 @@ def make_curvature_fn(
             counts.append(np.asarray(counted)[:num])
         return np.concatenate(counts)
 
-    def curvature(params, sampler_state, table, view_ids, within, progress_fn=None):
-        total = jnp.zeros((grid.num_vertices, 3))
+    def curvature(
+        params,
+        sampler_state,
+        table,
+        view_ids,
+        within,
+        progress_fn=None,
+        *,
+        group_ids=None,
+        num_groups=1,
+    ):
+        if group_ids is None:
+            group_ids = np.zeros(len(view_ids), np.int32)
+        total = jnp.zeros((num_groups * grid.num_vertices, 3))
         counts = all_counts(params, sampler_state, table, view_ids, within)
         report = progress_fn or (lambda num: None)
         report(int((counts == 0).sum()))
@@ -116,13 +142,14 @@ def make_curvature_fn(
                     table,
                     view_ids[rows],
                     within[rows],
+                    group_ids[rows],
                     (np.arange(chunk) < num).astype(np.float32),
                     bucket=bucket,
                 )
                 # The host would otherwise run ahead and queue every chunk's buffers at once.
                 jax.block_until_ready(total)
                 report(num)
-        return total
+        return total.reshape(num_groups, grid.num_vertices, 3)
 
     return curvature
 

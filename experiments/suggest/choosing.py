@@ -10,7 +10,6 @@ import jax
 import numpy as np
 
 from bavs_jax.cameras import Cameras, take
-from bavs_jax.candidates import Candidates
 from bavs_jax.selection.batch import SelectionInfo, acquire
 from bavs_jax.selection.context import SelectionError, make_context
 from bavs_jax.selection.information import (
@@ -32,6 +31,7 @@ from experiments.evaluate import spread_evenly
 from experiments.progress import track
 
 SUPPORTED_NEEDS = {"mean_uncertainty_fn", "information"}
+NUM_AT_ONCE = 8  # candidates between two steps of the progress bar
 NUM_COMPARED = 8  # photos whose repetition is what new views are compared with
 
 
@@ -86,7 +86,6 @@ def photo_information(
     is_training = np.zeros(len(problem.table.cameras), bool)
     is_training[problem.scene.pool] = True
     situation = Situation(train, problem.table, is_training, photo_rays(problem))
-    candidates = Candidates(cameras, np.arange(len(cameras)), np.ones(len(cameras), bool))
     precision = posterior_precision(
         jac_sq_sum,
         num_rays=situation.num_rays,
@@ -96,8 +95,9 @@ def photo_information(
     return Information(
         precision,
         make_cached_curvature_fn(
-            make_candidate_curvature_fn(toolbox, situation, candidates, scale),
+            make_candidate_curvature_fn(toolbox, situation, cameras, scale),
             num_vertices=toolbox.grid.num_vertices,
+            group_size=toolbox.group_size,
         ),
     )
 
@@ -106,10 +106,10 @@ def information_gains(information: Information, num: int, label: str) -> np.ndar
     """What each of `num` cameras would tell, `sum log(1 + h / H)`, nats [num]."""
     gains = []
     with track(num, label, "views") as bar:
-        for index in range(num):
-            gains.append(candidate_gains(information, [index], gain=log_det_gain)[0])
-            bar.advance()
-    return np.array(gains)
+        for indices in np.array_split(np.arange(num), -(-num // NUM_AT_ONCE)):
+            gains.append(candidate_gains(information, indices, gain=log_det_gain))
+            bar.advance(len(indices))
+    return np.concatenate(gains)
 
 
 def suggest(
