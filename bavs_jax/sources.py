@@ -12,7 +12,8 @@ import numpy as np
 
 from bavs_jax.cameras import Cameras, take
 from bavs_jax.candidates import Candidates
-from bavs_jax.fields.deformation import vertices_in_box
+from bavs_jax.fields.deformation import vertex_positions, vertices_in_box
+from bavs_jax.selection.directional import DirectionalInformation, Look, make_precision_fn
 from bavs_jax.selection.information import Information, make_cached_curvature_fn
 from bavs_jax.selection.policy import Policy
 from bavs_jax.uncertainty.model import ModelFns, Situation, Toolbox
@@ -82,6 +83,22 @@ def make_sources_fn(
 
         return mean_fn
 
+    def candidate_curvature(situation, candidates, seconds):
+        dense = make_candidate_curvature_fn(
+            toolbox, situation, candidates.cameras, options.image_scale
+        )
+
+        def timed(indices):
+            with _clock(seconds, "score"):
+                return jax.block_until_ready(dense(indices))
+
+        return make_cached_curvature_fn(
+            timed,
+            num_vertices=toolbox.grid.num_vertices,
+            max_bytes=options.cache_bytes,
+            group_size=toolbox.group_size,
+        )
+
     def make_information(key, situation, candidates, seconds):
         with _clock(seconds, "curvature"):
             jac_sq_sum = training_curvature(key, toolbox, situation, WEIGHTING)
@@ -91,21 +108,25 @@ def make_sources_fn(
                 prior_weight=toolbox.laplace.prior_weight,
                 weighting=WEIGHTING,
             )
-        dense = make_candidate_curvature_fn(
-            toolbox, situation, candidates.cameras, options.image_scale
-        )
+        return Information(precision, candidate_curvature(situation, candidates, seconds))
 
-        def timed(indices):
-            with _clock(seconds, "score"):
-                return jax.block_until_ready(dense(indices))
+    def make_directional(situation, candidates, seconds):
+        with _clock(seconds, "curvature"):
+            looks = training_looks(toolbox, situation, options.image_scale)
+        curvature_fn = candidate_curvature(situation, candidates, seconds)
+        positions = np.asarray(candidates.cameras.positions)
 
-        curvature_fn = make_cached_curvature_fn(
-            timed,
-            num_vertices=toolbox.grid.num_vertices,
+        def look_fn(indices):
+            for index, (rows, h) in zip(indices, curvature_fn(indices)):
+                yield Look(rows, h, positions[index])
+
+        precision_fn = make_precision_fn(
+            look_fn,
+            vertex_positions(toolbox.grid),
+            prior=2.0 * toolbox.laplace.prior_weight,
             max_bytes=options.cache_bytes,
-            group_size=toolbox.group_size,
         )
-        return Information(precision, curvature_fn)
+        return DirectionalInformation(looks, look_fn, precision_fn)
 
     def sources(policy: Policy, key, situation: Situation, candidates: Candidates) -> Sources:
         seconds = dict.fromkeys(("curvature", "fit", "score"), 0.0)
@@ -114,6 +135,7 @@ def make_sources_fn(
                 policy, key, situation, candidates, seconds
             ),
             "information": lambda: make_information(key, situation, candidates, seconds),
+            "directional": lambda: make_directional(situation, candidates, seconds),
         }
         if true_error_fn is not None:
             makers["true_error_fn"] = lambda: (
@@ -123,6 +145,23 @@ def make_sources_fn(
         return Sources({n: makers[n]() for n in sorted(policy.needs) if n in makers}, seconds)
 
     return sources
+
+
+def training_looks(toolbox: Toolbox, situation: Situation, image_scale: float) -> tuple[Look, ...]:
+    """The curvature that each training view by itself has brought, at a reduced size.
+
+    Of the same field and by the same rule as that of candidates, so that both can be compared.
+    """
+    cameras = take(situation.table.cameras, np.flatnonzero(situation.is_training_view))
+    curvature_fn = make_cached_curvature_fn(
+        make_candidate_curvature_fn(toolbox, situation, cameras, image_scale),
+        num_vertices=toolbox.grid.num_vertices,
+        max_bytes=0,
+        group_size=toolbox.group_size,
+    )
+    curvatures = curvature_fn(range(len(cameras)))
+    positions = np.asarray(cameras.positions)
+    return tuple(Look(rows, h, place) for (rows, h), place in zip(curvatures, positions))
 
 
 def make_candidate_curvature_fn(

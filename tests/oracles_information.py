@@ -43,3 +43,25 @@ def greedy_order(precision, curvatures, k, gain_fn) -> list[int]:
         picks.append(max(left, key=lambda c: (gain_fn(precision, curvatures[c]), -c)))
         precision = precision + curvatures[picks[-1]]
     return picks
+
+
+def directional_gain(prior, vertices, looks, look, sharpness) -> float:
+    """What one more look tells, vertex by vertex, from the angles themselves.
+
+    Args:
+      prior: > 0.
+      vertices: [G, 3].
+      looks: (h [G, 3], position [3]) of those before.
+      look: the same of the new one.
+      sharpness: of the kernel `((1 + cos angle) / 2)^sharpness`.
+    """
+    total = 0.0
+    new_h, new_position = (np.asarray(x, np.float64) for x in look)
+    for vertex, h in zip(np.asarray(vertices, np.float64), new_h):
+        known = np.full(3, prior, np.float64)
+        for old_h, old_position in looks:
+            a, b = new_position - vertex, np.asarray(old_position, np.float64) - vertex
+            cosine = a @ b / np.sqrt((a @ a) * (b @ b))
+            known += ((1.0 + cosine) / 2.0) ** sharpness * old_h[np.all(vertices == vertex, 1)][0]
+        total += sum(np.log((k + x) / k) for k, x in zip(known, h))
+    return total

@@ -9,8 +9,9 @@ import pytest
 from bavs_jax.selection import policies
 from bavs_jax.selection.batch import acquire
 from bavs_jax.selection.context import SelectionError, make_context
+from bavs_jax.selection.directional import DirectionalInformation, Look, make_precision_fn
 from bavs_jax.selection.distances import pairwise_distances
-from bavs_jax.selection.information import Information, make_cached_curvature_fn
+from bavs_jax.selection.information import Information, make_cached_curvature_fn, sparse_curvature
 from bavs_jax.selection.policies import POLICIES, get_policy
 from bavs_jax.selection.policies.farthest import make_farthest
 from bavs_jax.selection.policy import MODES
@@ -18,6 +19,7 @@ from tests import oracles_selection as oracles
 
 KEY = jax.random.key(0)
 NUM, NUM_CANDIDATES = 24, 20  # one size throughout, so that tests share their compilations
+NUM_VERTICES = 40
 
 every_policy = pytest.mark.parametrize("policy", POLICIES.values(), ids=POLICIES)
 
@@ -34,17 +36,37 @@ def curvature_sources(view_ids, *, ties):
 
 def information_sources(view_ids, *, ties):
     """Stands in for the curvature of the renders: a sparse one that depends on the view alone."""
-    num_vertices = 40
+    prior = np.full((NUM_VERTICES, 3), 0.1, np.float32)
+    return {"information": Information(prior, view_curvature_fn(view_ids, ties=ties))}
 
+
+def view_curvature_fn(view_ids, *, ties):
     def one(index):
         rng = np.random.default_rng(0 if ties else int(view_ids[index]))
-        return rng.exponential(size=(num_vertices, 3)) * (rng.uniform(size=(num_vertices, 1)) < 0.3)
+        return rng.exponential(size=(NUM_VERTICES, 3)) * (rng.uniform(size=(NUM_VERTICES, 1)) < 0.3)
 
     def dense(indices):
         return np.stack([one(index) for index in indices])
 
-    curvature_fn = make_cached_curvature_fn(dense, num_vertices=num_vertices, max_bytes=2**20)
-    return {"information": Information(np.full((num_vertices, 3), 0.1, np.float32), curvature_fn)}
+    return make_cached_curvature_fn(dense, num_vertices=NUM_VERTICES, max_bytes=2**20)
+
+
+def directional_sources(view_ids, *, ties):
+    """The same from places that depend on the view alone; one look has been taken."""
+    curvature_fn = view_curvature_fn(view_ids, ties=ties)
+
+    def place(index):
+        rng = np.random.default_rng(0 if ties else int(view_ids[index]))
+        return rng.normal(size=3).astype(np.float32) * 3.0
+
+    def look_fn(indices):
+        for index, (rows, h) in zip(indices, curvature_fn(indices)):
+            yield Look(rows, h, place(index))
+
+    vertices = np.random.default_rng(1).uniform(-1.0, 1.0, (NUM_VERTICES, 3))
+    first = Look(*sparse_curvature(np.ones((NUM_VERTICES, 3))), np.float32([0.0, 0.0, 4.0]))
+    precision_fn = make_precision_fn(look_fn, vertices, prior=0.1)
+    return {"directional": DirectionalInformation((first,), look_fn, precision_fn)}
 
 
 def true_error_sources(view_ids, *, ties):
@@ -57,6 +79,7 @@ def true_error_sources(view_ids, *, ties):
 SOURCES = {
     "mean_uncertainty_fn": curvature_sources,
     "information": information_sources,
+    "directional": directional_sources,
     "true_error_fn": true_error_sources,
 }
 

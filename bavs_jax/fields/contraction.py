@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 RADIUS = 2.0  # contracted space is [-2, 2]^3
+FARTHEST = 1e4  # half sides of the box; what stands for infinitely far
 
 
 def contract(x: jax.Array) -> jax.Array:
@@ -57,3 +58,17 @@ def unit_coordinates(box: jax.Array, positions: jax.Array, *, contracted: bool) 
         return jnp.clip((positions - lower) / (upper - lower), 0.0, 1.0)
     centred = (2.0 * positions - lower - upper) / (upper - lower)
     return contract(centred) / (2.0 * RADIUS) + 0.5
+
+
+def scene_positions(box: jax.Array, unit: jax.Array, *, contracted: bool) -> jax.Array:
+    """The inverse of `unit_coordinates`: [..., 3] in [0, 1] as positions in scene units.
+
+    Numerics: the faces of the unit cube, which stand for infinitely far in contracted space, are
+    put `FARTHEST` half sides of the box away.
+    """
+    lower, upper = box
+    if not contracted:
+        return lower + unit * (upper - lower)
+    most = RADIUS - 1.0 / FARTHEST
+    centred = uncontract(jnp.clip(2.0 * RADIUS * (unit - 0.5), -most, most))
+    return 0.5 * (lower + upper + centred * (upper - lower))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from bavs_jax.fields.contraction import in_box, unit_coordinates
+from bavs_jax.fields.contraction import in_box, scene_positions, unit_coordinates
 
 # The eight corners of a cell, [8, 3], z fastest.
 CORNERS = np.indices((2, 2, 2), np.int32).reshape(3, 8).T
@@ -42,11 +42,21 @@ def grid_coordinates(grid: DeformationGrid, positions: jax.Array) -> jax.Array:
     return unit_coordinates(grid.box, positions, contracted=grid.contracted) * grid.cells
 
 
+def unit_vertices(grid: DeformationGrid) -> np.ndarray:
+    """Vertices in the unit cube [G, 3], in the order of `vertex_number`."""
+    side = np.arange(grid.cells + 1) / grid.cells
+    return np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def vertex_positions(grid: DeformationGrid) -> jax.Array:
+    """Where the vertices are, [G, 3] scene units (see `scene_positions`)."""
+    unit = jnp.asarray(unit_vertices(grid), jnp.float32)
+    return scene_positions(grid.box, unit, contracted=grid.contracted)
+
+
 def vertices_in_box(grid: DeformationGrid) -> jax.Array:
     """Which vertices lie in the scene box, [G] bool: all of them where space is not contracted."""
-    side = np.arange(grid.cells + 1) / grid.cells
-    unit = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
-    return in_box(jnp.asarray(unit), contracted=grid.contracted)
+    return in_box(jnp.asarray(unit_vertices(grid)), contracted=grid.contracted)
 
 
 def vertex_number(grid: DeformationGrid, vertex: jax.Array) -> jax.Array:

@@ -39,6 +39,8 @@ class Context:
     mean_uncertainty_fn: Callable | None = struct.field(pytree_node=False, default=None)
     # The posterior of the field and what each candidate would add to it (`information.py`).
     information: Any = struct.field(pytree_node=False, default=None)
+    # What views told about each side of the field (`directional.py`).
+    directional: Any = struct.field(pytree_node=False, default=None)
     # Candidate indices int [n] -> mean squared error of their renders against their photos [n].
     true_error_fn: Callable | None = struct.field(pytree_node=False, default=None)
 
@@ -53,6 +55,7 @@ def make_context(
     mask=None,
     mean_uncertainty_fn: Callable | None = None,
     information: Any = None,
+    directional: Any = None,
     true_error_fn: Callable | None = None,
 ) -> Context:
     """Checks and builds a `Context`, on the host.
@@ -64,7 +67,7 @@ def make_context(
       centre: [3] scene centre, scene units.
       view_ids: [C] distinct integers >= 0; default 0 .. C - 1.
       mask: [C] bool, which candidates may be picked; default all.
-      mean_uncertainty_fn, information, true_error_fn: see `Context`.
+      mean_uncertainty_fn, information, directional, true_error_fn: see `Context`.
 
     Returns:
       A `Context` with nothing picked yet.
@@ -102,6 +105,7 @@ def make_context(
         picked=np.zeros(num, bool),
         mean_uncertainty_fn=mean_uncertainty_fn,
         information=information,
+        directional=directional,
         true_error_fn=true_error_fn,
     )
 
