@@ -14,7 +14,11 @@ from bavs_jax.cameras import Cameras, take
 from bavs_jax.candidates import Candidates
 from bavs_jax.fields.deformation import vertex_positions, vertices_in_box
 from bavs_jax.selection.directional import DirectionalInformation, Look, make_precision_fn
-from bavs_jax.selection.information import Information, make_cached_curvature_fn
+from bavs_jax.selection.information import (
+    DEFAULT_MAX_BYTES,
+    Information,
+    make_cached_curvature_fn,
+)
 from bavs_jax.selection.policy import Policy
 from bavs_jax.uncertainty.model import ModelFns, Situation, Toolbox
 from bavs_jax.uncertainty.models.laplace import training_curvature
@@ -111,22 +115,13 @@ def make_sources_fn(
         return Information(precision, candidate_curvature(situation, candidates, seconds))
 
     def make_directional(situation, candidates, seconds):
-        with _clock(seconds, "curvature"):
-            looks = training_looks(toolbox, situation, options.image_scale)
         curvature_fn = candidate_curvature(situation, candidates, seconds)
-        positions = np.asarray(candidates.cameras.positions)
-
-        def look_fn(indices):
-            for index, (rows, h) in zip(indices, curvature_fn(indices)):
-                yield Look(rows, h, positions[index])
-
-        precision_fn = make_precision_fn(
-            look_fn,
-            vertex_positions(toolbox.grid),
-            prior=2.0 * toolbox.laplace.prior_weight,
-            max_bytes=options.cache_bytes,
-        )
-        return DirectionalInformation(looks, look_fn, precision_fn)
+        with _clock(seconds, "curvature"):
+            return directional_information(
+                *(toolbox, situation, candidates.cameras, curvature_fn),
+                image_scale=options.image_scale,
+                max_bytes=options.cache_bytes,
+            )
 
     def sources(policy: Policy, key, situation: Situation, candidates: Candidates) -> Sources:
         seconds = dict.fromkeys(("curvature", "fit", "score"), 0.0)
@@ -145,6 +140,41 @@ def make_sources_fn(
         return Sources({n: makers[n]() for n in sorted(policy.needs) if n in makers}, seconds)
 
     return sources
+
+
+def directional_information(
+    toolbox: Toolbox,
+    situation: Situation,
+    cameras: Cameras,
+    curvature_fn: Callable,
+    *,
+    image_scale: float,
+    max_bytes: int = DEFAULT_MAX_BYTES,
+) -> DirectionalInformation:
+    """What the training views have told about each side, and what C cameras would add.
+
+    Args:
+      toolbox, situation: the field and its training views.
+      cameras: the candidates.
+      curvature_fn: theirs, as in `Information`.
+      image_scale: of the training views' width and height, as for candidates.
+      max_bytes: of host memory for precisions that are kept from pick to pick.
+    """
+    positions = np.asarray(cameras.positions)
+
+    def look_fn(indices):
+        for index, (rows, h) in zip(indices, curvature_fn(indices)):
+            yield Look(rows, h, positions[index])
+
+    precision_fn = make_precision_fn(
+        look_fn,
+        vertex_positions(toolbox.grid),
+        prior=2.0 * toolbox.laplace.prior_weight,
+        max_bytes=max_bytes,
+    )
+    return DirectionalInformation(
+        training_looks(toolbox, situation, image_scale), look_fn, precision_fn
+    )
 
 
 def training_looks(toolbox: Toolbox, situation: Situation, image_scale: float) -> tuple[Look, ...]:

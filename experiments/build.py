@@ -49,6 +49,7 @@ class Problem(NamedTuple):
     density: Callable  # (TrainState, positions [K, 3]) -> density [K], 0 where nothing is rendered
     make_toolbox: Callable  # track -> Toolbox
     model_fns: Callable  # (name of an uncertainty model, track) -> ModelFns
+    sources: Callable  # track -> what `make_sources_fn` makes
     lpips_fn: Callable | None
     lpips_reason: str | None
     calls_per_round: int
@@ -222,6 +223,7 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
         density=density,
         make_toolbox=make_toolbox,
         model_fns=model_fns,
+        sources=sources_fn,
         lpips_fn=lpips_fn,
         lpips_reason=lpips_reason,
         calls_per_round=calls_per_round(config),

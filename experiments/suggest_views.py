@@ -83,6 +83,7 @@ def suggest_views(data: pathlib.Path, folder: pathlib.Path, options: settings.Op
     config = FLAGS.config
     config.loader, config.image_size = FLAGS.loader, FLAGS.image_size
     config.holdout, config.train.num_steps = FLAGS.holdout, FLAGS.train_steps
+    config.candidates.image_scale = FLAGS.score_scale
     settings.name_scene(config, data)
     scene = load_scene(FLAGS.loader, root=data, image_size=FLAGS.image_size)
     scene = training.all_for_training(scene, FLAGS.holdout)

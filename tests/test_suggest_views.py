@@ -18,7 +18,6 @@ from bavs_jax.placement.collect import PlacementError
 from bavs_jax.placement.seen import count_seeing
 from bavs_jax.scenes.poses import user_transforms
 from bavs_jax.selection.context import SelectionError
-from bavs_jax.selection.policies import POLICIES
 from bavs_jax.selection.worth import Worth
 from experiments.suggest import choosing, exports, facts, page, places, settings
 from tests.scene_files import orbit, write_nerfstudio
@@ -301,9 +300,10 @@ def test_script_writes_poses_that_agree_with_each_other(finished):
     assert "remaining" in out and "dropped" in out
 
 
-def test_same_folder_uses_the_same_field_for_other_candidates(finished):
+def test_same_folder_uses_the_same_field_for_other_candidates_and_policies(finished):
     base, flags, _ = finished
-    done = script(*flags, "--holdout=2", "--candidates=box", "--bounds=-6,-6,0.5,6,6,5", cache=base)
+    box = ["--candidates=box", "--bounds=-6,-6,0.5,6,6,5"]
+    done = script(*flags, "--holdout=2", *box, "--policy=directional", cache=base)
     assert done.returncode == 0, done.stderr
     assert "train on" not in done.stdout.replace("photos to train on", "")
     frames = json.loads((base / "out/next_views/transforms.json").read_text())["frames"]
@@ -318,10 +318,10 @@ def test_wrong_folder_ends_in_one_line(finished, tmp_path):
     assert "Traceback" not in done.stderr
 
 
-def test_a_policy_that_is_unknown_or_needs_more_than_a_curvature_is_refused(monkeypatch):
-    with pytest.raises(SelectionError, match="bavz"):
-        choosing.check_policy("bavz")
-    greedy = POLICIES["bavs"]._replace(needs=frozenset({"mean_uncertainty_fn", "true_error_fn"}))
-    monkeypatch.setitem(POLICIES, "bavs", greedy)
-    with pytest.raises(SelectionError, match="needs true_error_fn"):
-        choosing.check_policy("bavs")
+def test_a_policy_that_is_unknown_or_needs_what_one_field_has_not_is_refused():
+    for name in ("bavs", "directional", "coverage", "entropy"):
+        choosing.check_policy(name)
+    refused = {"bavz": "bavz", "oracle": "photos", "activenerf": "field of kind 'variance'"}
+    for name, message in refused.items():
+        with pytest.raises(SelectionError, match=message):
+            choosing.check_policy(name)

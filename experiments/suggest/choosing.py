@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from bavs_jax.cameras import Cameras, take
+from bavs_jax.candidates import Candidates
 from bavs_jax.selection.batch import SelectionInfo, acquire
 from bavs_jax.selection.context import SelectionError, make_context
 from bavs_jax.selection.information import (
@@ -23,14 +24,13 @@ from bavs_jax.selection.policies import get_policy
 from bavs_jax.selection.worth import Worth, worth_along
 from bavs_jax.sources import make_candidate_curvature_fn
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.model import Situation
+from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
 from bavs_jax.uncertainty.posterior import posterior_precision
 from bavs_jax.uncertainty.scoring import mean_uncertainty, reduced_cameras
 from experiments.build import RENDER_CHUNK, Problem
 from experiments.evaluate import spread_evenly
 from experiments.progress import track
 
-SUPPORTED_NEEDS = {"mean_uncertainty_fn", "information"}
 NUM_AT_ONCE = 8  # candidates between two steps of the progress bar
 NUM_COMPARED = 8  # photos whose repetition is what new views are compared with
 
@@ -46,16 +46,15 @@ class Suggestion(NamedTuple):
 
 
 def check_policy(name: str) -> None:
-    """Raises SelectionError for a policy that is unknown or needs more than a curvature."""
+    """Raises SelectionError for a policy that is unknown or needs more than one field and poses."""
     policy = get_policy(name)
-    more = sorted(policy.needs - SUPPORTED_NEEDS)
-    if policy.uncertainty != "laplace":
-        more.append(policy.uncertainty)
-    if more:
-        raise SelectionError(
-            f"--policy: {name!r} needs {', '.join(more)}, which one field has not; "
-            "use another policy, such as bavs"
-        )
+    if "true_error_fn" in policy.needs:
+        reason = "needs the candidates' photos, which do not exist yet"
+    elif policy.field_kind != RECONSTRUCTION:
+        reason = f"needs a field of kind {policy.field_kind!r}"
+    else:
+        return
+    raise SelectionError(f"--policy: {name!r} {reason}; use another policy, such as bavs")
 
 
 def make_score_fn(problem: Problem, train: TrainState, cameras: Cameras, scale: float) -> Callable:
@@ -75,6 +74,17 @@ def photo_rays(problem: Problem) -> int:
     return int(np.diff(problem.scene.offsets)[problem.scene.pool].sum())
 
 
+def photo_situation(problem: Problem, train: TrainState, cameras: Cameras) -> Situation:
+    """All photos are trained on; C cameras are candidates."""
+    is_training = np.zeros(len(problem.table.cameras), bool)
+    is_training[problem.scene.pool] = True
+    return Situation(
+        *(train, problem.table, is_training, photo_rays(problem)),
+        candidates=cameras,
+        label="candidates",
+    )
+
+
 def photo_information(
     problem: Problem, train: TrainState, jac_sq_sum, cameras: Cameras, scale: float
 ) -> Information:
@@ -83,9 +93,7 @@ def photo_information(
     The sum of Eq 13 knows no colours, so a pose is enough.
     """
     toolbox = problem.make_toolbox(track)
-    is_training = np.zeros(len(problem.table.cameras), bool)
-    is_training[problem.scene.pool] = True
-    situation = Situation(train, problem.table, is_training, photo_rays(problem))
+    situation = photo_situation(problem, train, cameras)
     precision = posterior_precision(
         jac_sq_sum,
         num_rays=situation.num_rays,
@@ -145,18 +153,22 @@ def suggest(
         scores = score(jac_sq_sum, np.arange(len(cameras)), bar.advance)
     information = photo_information(problem, train, jac_sq_sum, cameras, scale)
     gains = information_gains(information, len(cameras), "what candidates would tell")
-    is_training = np.zeros(scene.num_views, bool)
-    is_training[scene.pool] = True
+
+    chooser = get_policy(policy)
+    source_key, choose_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
+    situation = photo_situation(problem, train, cameras)
+    fields = {"mean_uncertainty_fn": lambda rows, picked: scores[rows], "information": information}
+    if chooser.uncertainty != "laplace" or not chooser.needs <= fields.keys():
+        everyone = Candidates(cameras, np.arange(len(cameras)), np.ones(len(cameras), bool))
+        fields |= problem.sources(track)(chooser, source_key, situation, everyone).fields
     context = make_context(
         cameras.positions,
-        training_positions=np.asarray(scene.cameras.positions),
-        is_training_view=is_training,
+        training_positions=np.asarray(problem.table.cameras.positions),
+        is_training_view=situation.is_training_view,
         centre=centre,
-        mean_uncertainty_fn=lambda indices, picked: scores[indices],
-        information=information,
+        **fields,
     )
-    key = jax.random.fold_in(jax.random.key(seed), 1)
-    selected, info = acquire(get_policy(policy), key, context, num_views)
+    selected, info = acquire(chooser, choose_key, context, num_views)
 
     worth = worth_along(
         information,
