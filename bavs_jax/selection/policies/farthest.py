@@ -12,14 +12,19 @@ def euclidean(a, b, centre):
     return pairwise_distances(a, b)
 
 
+def nearest_chosen(ctx, distance=euclidean):
+    """Distance of each candidate to the nearest training view or pick, [C]."""
+    chosen = jnp.concatenate([ctx.training_positions, ctx.positions])
+    is_chosen = jnp.concatenate([ctx.is_training_view, ctx.picked])
+    return masked_nearest(distance(ctx.positions, chosen, ctx.centre), is_chosen)
+
+
 def make_farthest(*, name="farthest", summary, distance=euclidean) -> Policy:
     """Greedy farthest-view policy under `distance(a [N, 3], b [M, 3], centre [3]) -> [N, M]`."""
 
     def score(key, ctx):
         del key
-        chosen = jnp.concatenate([ctx.training_positions, ctx.positions])
-        is_chosen = jnp.concatenate([ctx.is_training_view, ctx.picked])
-        return masked_nearest(distance(ctx.positions, chosen, ctx.centre), is_chosen)
+        return nearest_chosen(ctx, distance)
 
     return Policy(
         name=name,
