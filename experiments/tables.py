@@ -20,7 +20,13 @@ from experiments import runtime
 from experiments.files import write_atomic
 from experiments.report import ReportError
 from experiments.report.results import load_runs
-from experiments.report.tables import Table, baseline_table, final_table, timing_table
+from experiments.report.tables import (
+    Table,
+    baseline_table,
+    final_table,
+    rounds_table,
+    timing_table,
+)
 
 FLAGS = flags.FLAGS
 flags.DEFINE_string("workdir", None, "Folder of an experiment: print its tables.")
@@ -44,7 +50,7 @@ def result_tables(folder: pathlib.Path) -> str:
     policies = list(dict.fromkeys(run.policy for run in runs))
     command = runs[0].result["command"]
     made = f"`{command}` ({runs[0].result['device']}; means over seeds ± half of the 95 % interval)"
-    tables = [final_table, baseline_table, timing_table]
+    tables = [final_table, rounds_table, baseline_table, timing_table]
     made_tables = [table for make in tables if (table := make(runs, policies)) is not None]
     return "\n\n".join([made, *map(markdown, made_tables)]) + "\n"
 

@@ -17,6 +17,7 @@ from experiments.report import (
     gaps,
     pictures,
     stats,
+    tables,
     write_report,
 )
 from experiments.report.headline import make_headline
@@ -127,6 +128,27 @@ def test_of_many_policies_the_few_that_matter_have_a_colour(tmp_path):
     words = _words(_page(tmp_path))
     assert "the means of the 5 other policies" in words
     assert "3 more policies are in the table" in words
+
+
+def test_the_gap_over_rounds_is_paired_and_leaves_the_initial_views_out(full_workdir):
+    runs = load_runs(full_workdir)
+    by_hand = []
+    for seed in range(3):
+        ours, theirs = (
+            np.mean([r["psnr"] for r in run.rounds if r["num_views"] > 4])
+            for name in ("bavs", "farthest")
+            for run in runs
+            if (run.policy, run.seed) == (name, seed)
+        )
+        by_hand.append(ours - theirs)
+    gap = stats.mean_round_gap(runs, "bavs", "farthest", "psnr")
+    half = scipy_stats.t.ppf(0.975, 2) * np.std(by_hand, ddof=1) / np.sqrt(3)
+    np.testing.assert_allclose([gap.mean, gap.half], [np.mean(by_hand), half])
+    table = tables.rounds_table(runs, ["random", "farthest", "bavs"])
+    assert table.head[1:3] == ("PSNR at 6 views (dB)", "PSNR at 8 views (dB)")
+    expected = f"{gap.mean:+.2f} ± {gap.half:.2f}".replace("-", "−")
+    assert table.rows[2][-1].text == expected
+    assert stats.mean_round_gap(runs, "bavs", "oracle", "psnr") is None
 
 
 # --- words -----------------------------------------------------------------------------------

@@ -65,6 +65,7 @@ def page_content(runs: list[Run]) -> dict:
         "qualities": [Markup(svg) for svg in qualities if svg],
         "missing": _missing(runs),
         "final": tables.final_table(runs, policies),
+        "by_round": tables.rounds_table(runs, policies),
         "all_runs": tables.runs_table(runs),
         "pictures": picture_sections,
         "bars": bars,

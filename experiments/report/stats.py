@@ -108,26 +108,47 @@ def compare(
     pairs = _pairs(runs, policy, reference, measure, num_views)
     if not pairs:
         return None
-    ours, theirs = zip(*pairs)
-    return Comparison(
-        mean_interval(ours), mean_interval(theirs), mean_interval(a - b for a, b in pairs)
-    )
+    ours, theirs = zip(*pairs.values())
+    gaps = mean_interval(a - b for a, b in pairs.values())
+    return Comparison(mean_interval(ours), mean_interval(theirs), gaps)
 
 
 def paired_gaps(
     runs: list[Run], policy: str, reference: str, measure: str, num_views: int
 ) -> list[float]:
     """The differences that `compare` averages, one for each seed that both policies have."""
-    return [a - b for a, b in _pairs(runs, policy, reference, measure, num_views)]
+    pairs = _pairs(runs, policy, reference, measure, num_views)
+    return [a - b for a, b in pairs.values()]
 
 
-def _pairs(runs, policy, reference, measure, num_views) -> list[tuple[float, float]]:
-    by_seed = [
+def mean_round_gap(runs: list[Run], policy: str, reference: str, measure: str) -> Interval | None:
+    """Paired gap averaged over the rounds in which views had been chosen, one number per seed.
+
+    A field trained from few views differs from run to run by luck; the mean over rounds has less
+    of that than the last round alone, and it also counts what is gained early.
+    """
+    numbers = chosen_num_views(runs)
+    by_round = [_pairs(runs, policy, reference, measure, n) for n in numbers]
+    seeds = set.intersection(*map(set, by_round)) if by_round else set()
+    return mean_interval(
+        np.mean([pairs[seed][0] - pairs[seed][1] for pairs in by_round]) for seed in sorted(seeds)
+    )
+
+
+def chosen_num_views(runs: list[Run]) -> list[int]:
+    """Numbers of views at which all completed runs were measured, without the initial views."""
+    sets = [{r["num_views"] for r in run.rounds} for run in completed(runs)]
+    return sorted(set.intersection(*sets))[1:] if sets else []
+
+
+def _pairs(runs, policy, reference, measure, num_views) -> dict[int, tuple[float, float]]:
+    """By seed, what the two policies reached."""
+    ours, theirs = (
         {run.seed: run.value(measure, num_views) for run in completed(runs, name)}
         for name in (policy, reference)
-    ]
-    pairs = [(value, by_seed[1].get(seed)) for seed, value in by_seed[0].items()]
-    return [(a, b) for a, b in pairs if a is not None and b is not None]
+    )
+    pairs = {seed: (value, theirs.get(seed)) for seed, value in ours.items()}
+    return {seed: pair for seed, pair in pairs.items() if None not in pair}
 
 
 def mean_curve(runs: list[Run], policy: str, measure: str) -> list[tuple[int, Interval]]:

@@ -83,9 +83,36 @@ def final_table(runs: list[Run], policies: list[str]) -> Table:
                 continue
             pair = stats.compare(runs, policy, reference, "psnr", num_views)
             gap = pair.gap if pair else None
-            row.append(interval_cell(gap, 2, f"{policy} and {reference} share no seed", gap=True))
+            row.append(_gap_cell(gap, f"{policy} and {reference} share no seed"))
         rows.append(tuple(row))
     return Table(tuple(head), tuple(rows))
+
+
+def rounds_table(runs: list[Run], policies: list[str]) -> Table | None:
+    """PSNR round by round, and the gap to each reference averaged over them; None for one round."""
+    numbers = stats.chosen_num_views(runs)
+    if len(numbers) < 2:
+        return None
+    done = [p for p in policies if stats.completed(runs, p)]
+    references = [p for p in REFERENCES if p in done and len(done) > 1]
+    rows = []
+    for policy in done:
+        row = [Cell(policy)]
+        for n in numbers:
+            interval = stats.over_seeds(runs, policy, "psnr", n)
+            row.append(interval_cell(interval, 2, f"{policy}: PSNR not measured"))
+        for reference in references:
+            gap = stats.mean_round_gap(runs, policy, reference, "psnr")
+            why = f"{policy} and {reference} share no seed"
+            same = policy == reference
+            row.append(dash("a policy has no gap to itself") if same else _gap_cell(gap, why))
+        rows.append(tuple(row))
+    head = ["policy", *(f"PSNR at {n} views (dB)" for n in numbers)]
+    return Table((*head, *(f"gap to {p}, mean of rounds (dB)" for p in references)), tuple(rows))
+
+
+def _gap_cell(gap: stats.Interval | None, why: str) -> Cell:
+    return interval_cell(gap, 2, why, gap=True)
 
 
 def runs_table(runs: list[Run]) -> Table:
