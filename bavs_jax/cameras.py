@@ -41,6 +41,11 @@ class Cameras:
         return self.world_from_cam.shape[0]
 
 
+def num_pixels(cameras: Cameras) -> np.ndarray:
+    """Pixels of each camera's image, and so its rays, [V] int."""
+    return np.prod(np.asarray(cameras.sizes), axis=-1)
+
+
 # --- pixels to rays --------------------------------------------------------------------------
 
 

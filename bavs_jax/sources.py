@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from bavs_jax.cameras import Cameras, take
+from bavs_jax.cameras import Cameras, num_pixels, take
 from bavs_jax.candidates import Candidates
 from bavs_jax.fields.deformation import vertex_positions, vertices_in_box
 from bavs_jax.selection.directional import DirectionalInformation, Look, make_precision_fn
@@ -74,7 +74,7 @@ def make_sources_fn(
                 if fns.condition is not None:
                     known = fns.condition(fitted, situation.train, picked)
                 small = reduced_cameras(take(candidates.cameras, indices), options.image_scale)
-                num_rays = _count_rays(small)
+                num_rays = int(num_pixels(small).sum())
                 label = f"{situation.label}: score {len(indices)} views"
                 with track(num_rays, label, "rays") as bar:
                     return mean_uncertainty(
@@ -209,8 +209,8 @@ def make_candidate_curvature_fn(
     if toolbox.laplace.extent == "box":
         counts = vertices_in_box(toolbox.grid)[:, None]
     small = reduced_cameras(cameras, image_scale)
-    whole_rays = np.prod(np.asarray(cameras.sizes), axis=-1)
-    small_rays = np.prod(np.asarray(small.sizes), axis=-1)
+    whole_rays = num_pixels(cameras)
+    small_rays = num_pixels(small)
     table = situation.table
     most = toolbox.group_size
 
@@ -233,10 +233,6 @@ def make_candidate_curvature_fn(
         return counts * scale.astype(np.float32)[:, None, None] * added[: len(indices)]
 
     return curvature
-
-
-def _count_rays(cameras) -> int:
-    return int(np.prod(np.asarray(cameras.sizes), axis=-1).sum())
 
 
 @contextlib.contextmanager

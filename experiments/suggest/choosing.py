@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from bavs_jax.cameras import Cameras, take
+from bavs_jax.cameras import Cameras, num_pixels, take
 from bavs_jax.candidates import Candidates
 from bavs_jax.selection.batch import SelectionInfo, acquire
 from bavs_jax.selection.context import SelectionError, make_context
@@ -148,7 +148,7 @@ def suggest(
     """
     scene = problem.scene
     score = make_score_fn(problem, train, cameras, scale)
-    num_rays = int(np.prod(np.asarray(reduced_cameras(cameras, scale).sizes), axis=-1).sum())
+    num_rays = int(num_pixels(reduced_cameras(cameras, scale)).sum())
     with track(num_rays, f"score {len(cameras)} candidates", "rays") as bar:
         scores = score(jac_sq_sum, np.arange(len(cameras)), bar.advance)
     information = photo_information(problem, train, jac_sq_sum, cameras, scale)

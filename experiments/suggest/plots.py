@@ -178,24 +178,15 @@ def worth_plot(worth: Worth, photo_gain: float) -> str:
     figure = Figure(figsize=(6.4, 3.7), layout="constrained")
     axes = figure.add_subplot()
     num = len(worth.picked)
+    curve = {"markersize": 5, "markeredgecolor": "white"}
     axes.plot(
-        np.arange(num + 1),
-        worth.best_left / first,
-        color=plots.BLUE,
-        marker="o",
-        markersize=5,
-        linewidth=2.0,
-        markeredgecolor="white",
+        *(np.arange(num + 1), worth.best_left / first),
+        **{**curve, "color": plots.BLUE, "marker": "o", "linewidth": 2.0},
         label="best candidate left after that many picks",
     )
     axes.plot(
-        np.arange(1, num + 1),
-        worth.picked / first,
-        color=plots.VERMILION,
-        marker="s",
-        markersize=5,
-        linewidth=1.2,
-        markeredgecolor="white",
+        *(np.arange(1, num + 1), worth.picked / first),
+        **{**curve, "color": plots.VERMILION, "marker": "s", "linewidth": 1.2},
         label="each pick, after those before",
     )
     axes.axhline(

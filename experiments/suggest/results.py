@@ -6,7 +6,7 @@ import pathlib
 
 import numpy as np
 
-from bavs_jax.cameras import Cameras, take
+from bavs_jax.cameras import Cameras, num_pixels, take
 from bavs_jax.placement.collect import Proposals
 from bavs_jax.rendering.images import render_views
 from bavs_jax.scenes.base import photo_cameras
@@ -66,7 +66,7 @@ def make_rows(suggestion: Suggestion, order) -> list[dict]:
 def render_previews(problem: Problem, train, jac_sq_sum, cameras: Cameras) -> list[dict]:
     """Colour, opacity and uncertainty of the chosen poses."""
     render = problem.render(train, jac_sq_sum, photo_rays(problem))
-    num_rays = int(np.prod(np.asarray(cameras.sizes), axis=-1).sum())
+    num_rays = int(num_pixels(cameras).sum())
     with track(num_rays, f"render {len(cameras)} previews", "rays") as bar:
         return render_views(
             render, cameras, np.arange(len(cameras)), chunk=RENDER_CHUNK, progress_fn=bar.advance
@@ -77,7 +77,7 @@ def photo_uncertainty(problem: Problem, train, jac_sq_sum, scale: float) -> np.n
     """Uncertainty of all pixels of the photos at the reduced size."""
     small = reduced_cameras(take(problem.scene.cameras, problem.scene.pool), scale)
     render = problem.render(train, jac_sq_sum, photo_rays(problem))
-    num_rays = int(np.prod(np.asarray(small.sizes), axis=-1).sum())
+    num_rays = int(num_pixels(small).sum())
     with track(num_rays, f"score the {len(small)} photos", "rays") as bar:
         images = render_views(
             lambda rays: {"uncertainty": render(rays)["uncertainty"]},
