@@ -292,6 +292,57 @@ def test_farthest_scores_are_distances_to_what_is_chosen():
         np.testing.assert_allclose(info.selected_scores[step], expected, rtol=1e-6)  # float32
 
 
+# --- spread ----------------------------------------------------------------------------------
+
+
+def squared_distance_left(ctx, batch) -> float:
+    """Mean over all candidates of the squared distance to the nearest chosen view."""
+    chosen = [*ctx.training_positions[ctx.is_training_view], *ctx.positions[list(batch)]]
+    return np.mean([oracles.nearest_distance(p, chosen) ** 2 for p in ctx.positions])
+
+
+def test_spread_scores_are_what_the_mean_squared_distance_falls_by():
+    ctx = pool_context(POLICIES["spread"])
+    selected, info = acquire(POLICIES["spread"], KEY, ctx, 4)
+    left = [squared_distance_left(ctx, selected[:n]) for n in range(5)]
+    np.testing.assert_allclose(info.selected_scores, -np.diff(left), rtol=1e-4)  # float32
+
+
+def test_spread_comes_near_the_best_batch():
+    """What has fallen is monotone and submodular: greedy reaches 1 - 1/e of the most."""
+    for seed in range(3):
+        ctx = pool_context(POLICIES["spread"], seed=seed, num_training=12)
+        start = squared_distance_left(ctx, [])
+        batches = itertools.combinations(np.flatnonzero(ctx.mask), 3)
+        best = max(start - squared_distance_left(ctx, batch) for batch in batches)
+        selected, _ = acquire(POLICIES["spread"], KEY, ctx, 3)
+        gained = start - squared_distance_left(ctx, selected)
+        assert (1.0 - 1.0 / np.e) * best <= gained <= best + 1e-6  # float32 against float64
+
+
+def test_spread_without_any_view_begins_in_the_middle():
+    line = np.stack([np.arange(5.0), np.zeros(5), np.zeros(5)], -1)
+    ctx = make_context(
+        line,
+        training_positions=np.zeros((1, 3)),
+        is_training_view=[False],
+        centre=np.zeros(3),
+    )
+    selected, _ = acquire(POLICIES["spread"], KEY, ctx, 1)
+    assert selected.tolist() == [2]
+
+
+@pytest.mark.parametrize(
+    "name, first", [("bavs_spread", "spread"), ("farthest_informative", "farthest")]
+)
+def test_products_of_two_scores(name, first):
+    ctx = pool_context(POLICIES[name])
+    parts = [POLICIES[part].score_fn(KEY, ctx) for part in (first, "directional")]
+    expected = np.asarray(parts[0], np.float64) * parts[1]
+    _, info = acquire(POLICIES[name], KEY, ctx, 1)
+    np.testing.assert_allclose(info.scores[ctx.mask], expected[ctx.mask], rtol=1e-5)
+
+
 # --- bavs ------------------------------------------------------------------------------------
 
 
