@@ -89,12 +89,15 @@ def final_table(runs: list[Run], policies: list[str]) -> Table:
 
 
 def rounds_table(runs: list[Run], policies: list[str]) -> Table | None:
-    """PSNR round by round, and the gap to each reference averaged over them; None for one round."""
+    """PSNR round by round, and the gap to each reference averaged over them.
+
+    None for one policy, or one round of choosing.
+    """
     numbers = stats.chosen_num_views(runs)
-    if len(numbers) < 2:
-        return None
     done = [p for p in policies if stats.completed(runs, p)]
-    references = [p for p in REFERENCES if p in done and len(done) > 1]
+    if len(numbers) < 2 or len(done) < 2:
+        return None
+    references = [p for p in REFERENCES if p in done]
     rows = []
     for policy in done:
         row = [Cell(policy)]
