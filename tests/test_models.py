@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from bavs_jax.cameras import take
-from bavs_jax.sources import WEIGHTING, make_candidate_curvature_fn
+from bavs_jax.sources import WEIGHTING, make_candidate_curvature_fn, training_looks
 from bavs_jax.training.batches import view_pixel_rays
 from bavs_jax.training.losses import gaussian_nll
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
 from bavs_jax.uncertainty.models import MODELS, get_model
+from bavs_jax.uncertainty.models.laplace import training_curvature
 from bavs_jax.uncertainty.scoring import mean_uncertainty, reduced_cameras
 from bavs_jax.uncertainty.true_error import make_true_error_fn
 from experiments.build import RENDER_CHUNK, build_problem
@@ -124,6 +125,22 @@ def test_candidates_add_what_their_photos_would(trained):
         assert expected.max() > 0
         # Sums of float32 in another order of rays.
         np.testing.assert_allclose(added, expected, rtol=1e-4, atol=1e-6 * expected.max())
+
+
+def test_looks_of_the_training_views_add_up_to_their_curvature(trained):
+    problem, situation = trained
+    toolbox = problem.make_toolbox(silent)
+    looks = training_looks(toolbox, situation, 1.0)
+    taken = np.flatnonzero(situation.is_training_view)
+    positions = np.asarray(situation.table.cameras.positions)[taken]
+    np.testing.assert_array_equal([look.position for look in looks], positions)
+    total = np.zeros((toolbox.grid.num_vertices, 3))
+    for look in looks:
+        np.add.at(total, np.asarray(look.rows), np.asarray(look.h))
+    jac_sq_sum = training_curvature(jax.random.key(0), toolbox, situation, WEIGHTING)
+    expected = 2.0 / situation.num_rays * np.asarray(jac_sq_sum)
+    # Sums of float32 in another order of rays.
+    np.testing.assert_allclose(total, expected, rtol=1e-4, atol=1e-6 * expected.max())
 
 
 def test_true_error_of_a_constant_render(trained):
