@@ -15,7 +15,8 @@ def device_name() -> str:
     device = jax.devices()[0]
     if device.platform != "cpu":
         return f"{device.device_kind} x {jax.device_count()}"
-    return f"CPU, {platform.machine()}, {len(_cpu_affinity())} cores"
+    cores = len(_cpu_affinity())
+    return f"CPU, {platform.machine()}, {cores} core{'s' if cores > 1 else ''}"
 
 
 def _cpu_affinity() -> set[int]:

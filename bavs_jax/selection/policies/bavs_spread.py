@@ -1,6 +1,6 @@
-"""Spread times directional information: ours, and what we suggest to use.
+"""Spread times directional information.
 
-The soft form of the paper's batch policy (Fig 5, Eq 15). Where that first drops what is near and
+Ours, and the soft form of the paper's batch policy (Fig 5, Eq 15). Where that first drops what is near and
 then asks for uncertainty alone, every view is asked for both: what it does for all places one could
 look from (`spread`), and what its rays would tell about sides of the scene that no view has looked
 at (`directional`). Distance needs no field and leads while the field is poor.
