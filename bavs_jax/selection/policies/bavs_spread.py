@@ -1,9 +1,9 @@
 """Spread times directional information.
 
-Ours, and the soft form of the paper's batch policy (Fig 5, Eq 15). Where that first drops what is near and
-then asks for uncertainty alone, every view is asked for both: what it does for all places one could
-look from (`spread`), and what its rays would tell about sides of the scene that no view has looked
-at (`directional`). Distance needs no field and leads while the field is poor.
+Ours, and the soft form of the paper's batch policy (Fig 5, Eq 15). Where that first drops what is
+near and then asks for uncertainty alone, every view is asked for both: what it does for all places
+one could look from (`spread`), and what its rays would tell about sides of the scene that no view
+has looked at (`directional`). Distance needs no field and leads while the field is poor.
 """
 
 import numpy as np
