@@ -45,10 +45,15 @@ def evaluate_views(render_fn, scene, view_ids, *, lpips_fn=None, progress_fn=Non
         chunk=RENDER_CHUNK,
         progress_fn=progress_fn,
     )
-    rows = [_measure(scene, v, image, lpips_fn) for v, image in zip(view_ids, images)]
-    means = {k: _mean([row.get(k) for row in rows]) for k in ("psnr", "ssim", "lpips", "depth_mae")}
+    means = mean_quality(scene, view_ids, images, lpips_fn=lpips_fn)
     thinned = float(np.mean([image["thinned"].mean() for image in images]))
-    return {**means, "thinned": thinned, "num_test_views": len(rows)}
+    return {**means, "thinned": thinned, "num_test_views": len(images)}
+
+
+def mean_quality(scene, view_ids, images: list[dict], *, lpips_fn=None) -> dict:
+    """Means over views of what `evaluate_views` measures, of images that are rendered already."""
+    rows = [_measure(scene, v, image, lpips_fn) for v, image in zip(view_ids, images)]
+    return {k: _mean([row.get(k) for row in rows]) for k in ("psnr", "ssim", "lpips", "depth_mae")}
 
 
 _measure_images = jax.jit(measure_images, static_argnames="lpips_fn")

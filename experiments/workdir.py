@@ -10,7 +10,10 @@ from experiments.files import write_atomic, write_json
 
 SUMMARY_VERSION = 1
 # What may differ when a folder is taken up again: more policies or seeds add runs.
-EXTENSIBLE = ("policies", "seeds", "checkpoint_seconds", "data_dir", "num_pictures")
+EXTENSIBLE = (
+    *("policies", "seeds", "checkpoint_seconds", "data_dir", "num_pictures"),
+    "evaluation.models",
+)
 
 
 def claim(workdir: pathlib.Path, config) -> None:

@@ -125,6 +125,13 @@ def get_config() -> ConfigDict:
     config.uncertainty.ensemble_size = 3  # fields, the run's own among them
     config.uncertainty.max_rays = 0  # training rays in the curvature; 0: all
 
+    # --- experiments.evaluate_uncertainty ---
+    config.evaluation = ConfigDict()
+    config.evaluation.models = ("laplace", "cf_nerf", "learned_variance", "ensemble", "entropy")
+    config.evaluation.num_views = 50  # test views, evenly spaced; 0: all
+    config.evaluation.scale_depth = False  # one factor for all depths, where their unit is unknown
+    config.evaluation.variant = "depth_mae_per_image"  # that the page shows first
+
     # --- candidates (bavs_jax/candidates.py, bavs_jax/selection) ---
     config.candidates = ConfigDict()
     config.candidates.source = "dataset"  # "dataset" or "hemisphere" (Eq 14)

@@ -1,0 +1,1 @@
+"""How well uncertainty tells error: parts of `experiments.evaluate_uncertainty`."""
