@@ -4,7 +4,9 @@
         --config=experiments/configs/uncertainty.py --workdir=runs/uncertainty
 
 Every uncertainty model is measured on test views by AUSE in all its variants, on its own field and
-on one common field. What is there already in --workdir is not computed again; a folder that
+on one common field; and its uncertainty is turned into intervals of colour and depth, calibrated on
+views that nothing was trained on and tested on yet others. What is there already in --workdir is
+not computed again: one may kill it and start it again. A folder that
 `experiments.active_selection` has filled with the same config is taken up where it ended.
 """
 
@@ -15,24 +17,22 @@ import pathlib
 import sys
 import time
 
-import jax
 import numpy as np
 from absl import flags
 from ml_collections import config_flags
 
-from bavs_jax.uncertainty.model import Situation
+from bavs_jax.uncertainty.conformal_scale import SCALES
 from bavs_jax.uncertainty.models import MODELS
 from experiments import runtime, workdir
-from experiments.build import Problem, build_problem, run_key
+from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
 from experiments.errors import USER_ERRORS, check_choice
-from experiments.evaluate import mean_quality, spread_evenly
-from experiments.files import write_arrays, write_json
-from experiments.machine import device_name
-from experiments.runner import Run
-from experiments.uncertain import measure
+from experiments.files import write_json
+from experiments.machine import device_name, versions
+from experiments.uncertain import intervals
+from experiments.uncertain.one_seed import measure_seed
 from experiments.uncertain.page import write_page
-from experiments.uncertain.results import row_path
+from experiments.uncertain.results import NAME, SCHEMA_VERSION, row_path
 
 FLAGS = flags.FLAGS
 config_flags.DEFINE_config_file(
@@ -45,67 +45,12 @@ config_flags.DEFINE_config_file(
 flags.DEFINE_string("workdir", None, "Folder for fields, uncertainty.json and uncertainty.html.")
 flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
 
-SCHEMA_VERSION = 1
-
-
-def trained_situation(config, problem: Problem, folder: pathlib.Path, seed: int, command: str):
-    """The field of a seed at the end of its run of the config's first policy."""
-    first = Run(config, problem, folder, None, seed, command)
-    first.finish()
-    policy = config.policies[0] if config.num_rounds else None
-    if policy is not None:
-        Run(config, problem, folder, policy, seed, command).finish(first)
-    state = Run(config, problem, folder, policy, seed, command).state()
-    num_rays = int(np.diff(problem.scene.offsets)[first.initial].sum())
-    return Situation(
-        *(state.train, state.table, state.is_training_view, num_rays), label=f"seed {seed}"
-    )
-
-
-def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, command: str) -> None:
-    """Every model that has no result yet."""
-    paths = {name: row_path(folder, name, seed) for name in config.evaluation.models}
-    if all(path.exists() for path in paths.values()):
-        return
-    scene, options = problem.scene, config.evaluation
-    situation = trained_situation(config, problem, folder, seed, command)
-    view_ids = spread_evenly(scene.test, options.num_views)
-    key = jax.random.fold_in(run_key(seed), 2**31 - 3)
-    common = measure.render_model(problem, "entropy", key, situation, view_ids).images
-    common_errors = measure.pixel_errors(scene, view_ids, common, scale_depth=options.scale_depth)
-    for name, path in paths.items():
-        if path.exists():
-            continue
-        model = measure.render_model(problem, name, key, situation, view_ids)
-        own_errors = measure.pixel_errors(
-            scene, view_ids, model.images, scale_depth=options.scale_depth
-        )
-        own = measure.all_ause(own_errors, model.images)
-        shared = measure.all_ause(common_errors, model.images)
-        quality = mean_quality(scene, view_ids, model.images)
-        arrays = measure.curve_arrays(own, "own") | measure.curve_arrays(shared, "common")
-        shown = np.arange(min(config.num_pictures, len(view_ids))) * len(view_ids)
-        shown = shown // max(config.num_pictures, 1)
-        arrays |= measure.picture_arrays(scene, view_ids, model.images, shown)
-        write_arrays(path.with_suffix(".npz"), **arrays)
-        row = {
-            "model": name,
-            "seed": seed,
-            "num_views": int(np.sum(situation.is_training_view)),
-            "num_test_views": len(view_ids),
-            "psnr": quality["psnr"],
-            "ssim": quality["ssim"],
-            "seconds": {"fit": model.fit_seconds, "render": model.render_seconds},
-            "own": measure.ause_numbers(own),
-            "common": measure.ause_numbers(shared),
-        }
-        write_json(path, row)
-
 
 def evaluate(config, folder: pathlib.Path, command: str) -> None:
     """All seeds, then the summary and the page."""
     for name in config.evaluation.models:
         check_choice("evaluation.models", name, tuple(MODELS))
+    check_choice("evaluation.interval_scale", config.evaluation.interval_scale, SCALES)
     start = time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     workdir.claim(folder, config)
@@ -117,30 +62,31 @@ def evaluate(config, folder: pathlib.Path, command: str) -> None:
     models, seeds = config.evaluation.models, config.seeds
     paths = [row_path(folder, model, seed) for model in models for seed in seeds]
     rows = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+    # The same for all models of a seed.
+    interval_views = {str(row["seed"]): row.pop("interval_views") for row in rows}
     result = {
         "schema_version": SCHEMA_VERSION,
         "scene": scene.name,
         "kind": config.loader,
+        "image_size": np.asarray(scene.cameras.sizes).max(axis=0).tolist(),
+        "seeds": list(seeds),
         "command": command,
         "config": config.to_dict(),
         "device": device_name(),
+        "versions": versions(),
+        "pixel_rule": intervals.pixel_rule(config.evaluation.num_interval_pixels),
+        "interval_views": interval_views,
         "rows": rows,
     }
-    write_json(folder / "uncertainty.json", result)
+    write_json(folder / NAME, result)
     arrays = {
         model: [dict(np.load(row_path(folder, model, s).with_suffix(".npz"))) for s in seeds]
         for model in models
     }
     write_page(
-        folder / "uncertainty.html",
-        title=f"{scene.name}, {rows[0]['num_views']} training views",
-        command=command,
-        rows=rows,
-        curves=arrays,
-        pictures={model: found[0] for model, found in arrays.items()},
-        variant=config.evaluation.variant,
+        folder / "uncertainty.html", result, arrays=arrays, variant=config.evaluation.variant
     )
-    print(f"numbers: {folder / 'uncertainty.json'}")
+    print(f"numbers: {folder / NAME}")
     print(f"page:    {folder / 'uncertainty.html'}  ({time.monotonic() - start:.0f} s in all)")
 
 

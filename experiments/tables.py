@@ -5,7 +5,8 @@
 
 The first prints the tables of one experiment. The second writes every table of a page anew: each
 stands between `<!-- results: FOLDER -->` and `<!-- end of results -->`, where FOLDER holds a
-`summary.json` and is relative to the page.
+`summary.json`, or the `uncertainty.json` of `experiments.evaluate_uncertainty`, and is relative to
+the page.
 """
 
 from __future__ import annotations
@@ -27,6 +28,9 @@ from experiments.report.tables import (
     rounds_table,
     timing_table,
 )
+from experiments.uncertain.results import NAME as UNCERTAINTY_FILE
+from experiments.uncertain.results import known_quantities, load_result, split_words
+from experiments.uncertain.tables import coverage_table, summary_table
 
 FLAGS = flags.FLAGS
 flags.DEFINE_string("workdir", None, "Folder of an experiment: print its tables.")
@@ -45,6 +49,17 @@ def markdown(table: Table) -> str:
 
 
 def result_tables(folder: pathlib.Path) -> str:
+    """All tables of the experiment whose result file a folder holds.
+
+    Raises:
+      ReportError: it holds none, or one that cannot be used.
+    """
+    if (folder / UNCERTAINTY_FILE).exists() and not (folder / "summary.json").exists():
+        return _uncertainty_tables(folder)
+    return _run_tables(folder)
+
+
+def _run_tables(folder: pathlib.Path) -> str:
     """Quality at the last shared number of views, and where the time went."""
     runs = load_runs(folder)
     policies = list(dict.fromkeys(run.policy for run in runs))
@@ -53,6 +68,19 @@ def result_tables(folder: pathlib.Path) -> str:
     tables = [final_table, rounds_table, baseline_table, timing_table]
     made_tables = [table for make in tables if (table := make(runs, policies)) is not None]
     return "\n\n".join([made, *map(markdown, made_tables)]) + "\n"
+
+
+def _uncertainty_tables(folder: pathlib.Path) -> str:
+    """How well uncertainty tells error, and how well calibrated intervals hold."""
+    result = load_result(folder)
+    rows = result["rows"]
+    parts = [
+        f"`{result['command']}` ({result['device']}; means over seeds ± half of the 95 % interval)",
+        markdown(summary_table(rows)),
+        f"Intervals: {split_words(result)}. Coverage ± its standard error over the test views.",
+        *(markdown(coverage_table(rows, quantity)) for quantity in known_quantities(rows)),
+    ]
+    return "\n\n".join(parts) + "\n"
 
 
 def fill_page(text: str, root: pathlib.Path) -> str:

@@ -11,7 +11,8 @@ import pytest
 
 from bavs_jax.metrics.ause import sparsification
 from experiments.uncertain import measure
-from experiments.uncertain.results import ause_table, known_variants, mean_curves
+from experiments.uncertain.results import known_variants, mean_curves
+from experiments.uncertain.tables import ause_table
 from tests.toy_runs import toy_flags
 from tests.toy_scenes import toy_scene
 

@@ -47,33 +47,48 @@ def has_band(quantity: str, image: dict) -> np.ndarray:
     return (image["opacity"] >= MIN_OPACITY) & np.isfinite(uncertainty_of(quantity, image))
 
 
-def band_errors(
+def render_errors(
     quantity: str, image: dict, truth, known=None, *, depth_factor: float = 1.0
-) -> ViewErrors | None:
-    """Absolute errors of a render where it has a band and the truth is known.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Absolute error of each pixel of a render, and where the truth is known.
 
     Args:
-      quantity: "colour": the largest over the channels, so that a band holds all three; or "depth".
-      image: of one view "rgb" [..., 3], "depth", "opacity" and "uncertainty" [...], all its pixels
-        or some.
+      quantity: "colour": the largest error over the channels, so that a band holds all three; or
+        "depth".
+      image: of one view "rgb" [..., 3] and "depth" [...], all its pixels or some.
       truth: as "rgb", in 0 .. 1; or as "depth", scene units, 0 where unknown.
       known: [...] bool, False where the truth does not count; None where all of it does.
       depth_factor: of the rendered depth.
 
     Returns:
-      those pixels, or None of none.
+      errors [...] and bool [...].
     """
-    counts = has_band(quantity, image)
+    truth = np.asarray(truth, np.float64)
     if quantity == "depth":
-        counts = counts & (truth > 0.0)
-        error = np.abs(depth_factor * image["depth"].astype(np.float64) - truth)
+        errors, counts = np.abs(depth_factor * image["depth"] - truth), truth > 0.0
     else:
-        error = np.abs(np.clip(image["rgb"].astype(np.float64), 0.0, 1.0) - truth).max(-1)
-    if known is not None:
-        counts = counts & known
+        errors = np.abs(np.clip(image["rgb"], 0.0, 1.0) - truth).max(-1)
+        counts = np.ones(errors.shape, bool)
+    return errors, counts if known is None else counts & known
+
+
+def band_errors(
+    quantity: str, image: dict, truth, known=None, *, depth_factor: float = 1.0
+) -> ViewErrors | None:
+    """What `calibrate_renders` learns from of one view: pixels with a band and a known truth.
+
+    Args:
+      quantity, truth, known, depth_factor: see `render_errors`.
+      image: further "opacity", "uncertainty" and maybe "depth_uncertainty", see `has_band`.
+
+    Returns:
+      errors and uncertainty, or None where no pixel has both.
+    """
+    errors, counts = render_errors(quantity, image, truth, known, depth_factor=depth_factor)
+    counts = counts & has_band(quantity, image)
     if not counts.any():
         return None
-    return ViewErrors(error[counts], uncertainty_of(quantity, image)[counts].astype(np.float64))
+    return ViewErrors(errors[counts], uncertainty_of(quantity, image)[counts].astype(np.float64))
 
 
 def calibrate_renders(
@@ -132,9 +147,7 @@ def add_bands(calibration: RenderCalibration, image: dict, level: float) -> dict
             continue
         banded = has_band(quantity, image)
         values = np.asarray(uncertainty_of(quantity, image))[banded]
-        ends = interval(
-            calibrated, found[name][banded], values, level, bounds=QUANTITIES[quantity]
-        )
+        ends = interval(calibrated, found[name][banded], values, level, bounds=QUANTITIES[quantity])
         for end, part in zip(("lower", "upper"), ends):
             found[f"{name}_{end}"] = _filled(banded, part)
         found[f"{name}_half"] = _filled(banded, half_width(calibrated, values, level))

@@ -36,6 +36,8 @@ class CoverageReport(NamedTuple):
     mean_width: np.ndarray  # [L] upper - lower end, unit of the error; mean over views
     score: np.ndarray  # [L] as `interval_score`, unit of the error; mean over views
     constant_coverage: np.ndarray  # [L] as `coverage`, of the constant interval
+    constant_decile_coverage: np.ndarray  # [L, 10] as `decile_coverage`, likewise
+    constant_width: np.ndarray  # [L] unit of the error
     width_ratio: np.ndarray  # [L] mean width / that of the constant interval; NaN if infinite
     score_ratio: np.ndarray  # [L] score / that of the constant interval; NaN if infinite
 
@@ -88,6 +90,8 @@ def coverage_report(calibrated: Calibrated, test: Sequence[ViewErrors]) -> Cover
         mean_width=mean_width,
         score=score,
         constant_coverage=_mean_over_views(is_covered_by_constant, sizes),
+        constant_decile_coverage=share_by_decile(is_covered_by_constant, uncertainty),
+        constant_width=constant_width,
         width_ratio=width_ratio,
         score_ratio=score_ratio,
     )

@@ -128,9 +128,14 @@ def get_config() -> ConfigDict:
     # --- experiments.evaluate_uncertainty ---
     config.evaluation = ConfigDict()
     config.evaluation.models = ("laplace", "cf_nerf", "learned_variance", "ensemble", "entropy")
-    config.evaluation.num_views = 50  # test views, evenly spaced; 0: all
+    config.evaluation.num_views = 50  # test views of AUSE, evenly spaced; 0: all
     config.evaluation.scale_depth = False  # one factor for all depths, where their unit is unknown
     config.evaluation.variant = "depth_mae_per_image"  # that the page shows first
+    # Views for intervals, none trained on: test views, then unused ones of the pool; 0: all. A
+    # quarter fits the scale, a half calibrates (48 or more promise 95 % well), a quarter tests.
+    config.evaluation.num_interval_views = 200
+    config.evaluation.num_interval_pixels = 1000  # of each such view, drawn uniformly; 0: all
+    config.evaluation.interval_scale = "isotonic"  # "isotonic", "uncertainty" or "constant"
 
     # --- candidates (bavs_jax/candidates.py, bavs_jax/selection) ---
     config.candidates = ConfigDict()

@@ -11,4 +11,5 @@ def get_config():
     config.seeds = (0, 1, 2, 3, 4)
     config.train.num_steps = 1600
     config.lpips_net = ""
+    config.num_test_final = 25  # of the run; AUSE and intervals have views of their own
     return config

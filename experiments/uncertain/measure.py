@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from bavs_jax.metrics.ause import ERRORS, Sparsification, mean_sparsification, variant_name
 from bavs_jax.rendering.images import render_views
+from bavs_jax.uncertainty.bands import uncertainty_of
 from bavs_jax.uncertainty.model import Situation
 from experiments.build import RENDER_CHUNK, Problem
 from experiments.progress import track
@@ -19,33 +21,43 @@ from experiments.progress import track
 IMAGES = ("rgb", "depth", "opacity", "uncertainty", "depth_uncertainty")
 
 
+class FittedModel(NamedTuple):
+    """A model that is ready to render."""
+
+    render: Callable  # rays [chunk] -> images, those of `IMAGES` that the model has
+    seconds: float  # that it took to fit
+
+
 class ModelImages(NamedTuple):
     """What a model says about some views."""
 
-    images: list[dict[str, np.ndarray]]  # of each view, by `IMAGES`, those that the model has
-    fit_seconds: float
-    render_seconds: float
+    images: list[dict[str, np.ndarray]]  # of each view
+    seconds: float
 
 
-def render_model(problem: Problem, name: str, key, situation: Situation, view_ids) -> ModelImages:
-    """Fits a model to the training views of a situation and renders views with it."""
-    scene = problem.scene
+def fit_model(problem: Problem, name: str, key, situation: Situation) -> FittedModel:
+    """Fits a model to the training views of a situation."""
     fns = problem.model_fns(name, track)
     start = time.perf_counter()
     fitted = jax.block_until_ready(fns.fit(key, situation))
-    fit_seconds = time.perf_counter() - start
+    seconds = time.perf_counter() - start
 
-    def images(rays):
+    def render(rays):
         rendered = fns.render(fitted, situation.train, rays)
         return {k: rendered[k] for k in IMAGES if k in rendered}
 
+    return FittedModel(render, seconds)
+
+
+def render_model(scene, fitted: FittedModel, view_ids, label: str) -> ModelImages:
+    """Renders whole views with a fitted model."""
     start = time.perf_counter()
     num_rays = int(np.diff(scene.offsets)[view_ids].sum())
-    with track(num_rays, f"{situation.label}: {name} on {len(view_ids)} views", "rays") as bar:
+    with track(num_rays, f"{label} on {len(view_ids)} views", "rays") as bar:
         rendered = render_views(
-            images, scene.cameras, view_ids, chunk=RENDER_CHUNK, progress_fn=bar.advance
+            fitted.render, scene.cameras, view_ids, chunk=RENDER_CHUNK, progress_fn=bar.advance
         )
-    return ModelImages(rendered, fit_seconds, time.perf_counter() - start)
+    return ModelImages(rendered, time.perf_counter() - start)
 
 
 def pixel_errors(scene, view_ids, images: list[dict], *, scale_depth: bool) -> dict[str, list]:
@@ -96,16 +108,11 @@ def all_ause(errors: dict[str, list], images: list[dict]) -> dict[str, Sparsific
     """
     found = {}
     for (of, parts), error, pooled in itertools.product(errors.items(), ERRORS, (False, True)):
-        pick = partial(_uncertainty_of, of)
-        pairs = [(e, pick(image)[k]) for (e, k), image in zip(parts, images) if len(e)]
+        pick = partial(uncertainty_of, of)
+        pairs = [(e, pick(image).ravel()[k]) for (e, k), image in zip(parts, images) if len(e)]
         name = variant_name(of=of, error=error, pooled=pooled)
         found[name] = mean_sparsification(pairs, error=error, pooled=pooled)
     return found
-
-
-def _uncertainty_of(of: str, image: dict) -> np.ndarray:
-    name = "depth_uncertainty" if of == "depth" and "depth_uncertainty" in image else "uncertainty"
-    return np.asarray(image[name]).ravel()
 
 
 def ause_numbers(found: dict[str, Sparsification]) -> dict[str, dict[str, float]]:

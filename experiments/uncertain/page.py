@@ -1,4 +1,4 @@
-"""The page that shows how well each model's uncertainty tells the error."""
+"""The page that shows how well each model's uncertainty tells the error, and its intervals."""
 
 from __future__ import annotations
 
@@ -10,31 +10,30 @@ from markupsafe import Markup
 
 from experiments.files import write_atomic
 from experiments.report.pictures import ERROR_MAP, UNCERTAINTY_MAP, colourise, png_uri, shrink
+from experiments.uncertain.band_picture import LEVEL, band_strip, scanline_plot
+from experiments.uncertain.coverage_plots import coverage_plot, decile_plot, width_plot
 from experiments.uncertain.plots import curve_plot
-from experiments.uncertain.results import FIELDS, ause_table, known_variants
+from experiments.uncertain.results import (
+    FIELDS,
+    known_quantities,
+    known_variants,
+    left_out_words,
+    models_of,
+    split_words,
+    title,
+)
+from experiments.uncertain.tables import ause_table, coverage_table, summary_table
 
 MAX_SIDE = 240  # pixels of a picture
 
 
-def write_page(
-    path: pathlib.Path,
-    *,
-    title: str,
-    command: str,
-    rows: list[dict],
-    curves: dict[str, list[dict]],
-    pictures: dict[str, dict[str, np.ndarray]],
-    variant: str,
-) -> None:
-    """Curves, tables of every variant, and pictures of some views.
+def write_page(path: pathlib.Path, result: dict, *, arrays: dict, variant: str) -> None:
+    """Curves, tables of every variant, calibrated intervals, and pictures of some views.
 
     Args:
       path: where to.
-      title: what was measured.
-      command: how it was made.
-      rows: of the result file.
-      curves: by model, arrays of each seed.
-      pictures: by model, arrays [n, H, W, ...] of some views of the first seed.
+      result: what the result file holds.
+      arrays: by model, the arrays of each seed; pictures are those of the first seed.
       variant: the AUSE that is shown first.
     """
     environment = jinja2.Environment(
@@ -44,16 +43,29 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    rows = result["rows"]
     variants = known_variants(rows)
     variant = variant if variant in variants else variants[0]
     titles = {field: f"Error of what is left, {words}" for field, words in FIELDS.items()}
+    pictures = {model: found[0] for model, found in arrays.items()}
+    shown = models_of(rows)[0]
     text = environment.get_template("template.html").render(
-        title=title,
-        command=command,
+        title=title(result),
+        result=result,
         variant=variant,
-        plots=[Markup(curve_plot(curves, field, variant, titles[field])) for field in FIELDS],
-        first=ause_table(rows, variant),
-        others=[(name, ause_table(rows, name)) for name in variants if name != variant],
+        summary=summary_table(rows),
+        plots=[Markup(curve_plot(arrays, field, variant, titles[field])) for field in FIELDS],
+        variants=[(name, ause_table(rows, name)) for name in variants],
+        split=split_words(result),
+        coverage=[coverage_table(rows, quantity) for quantity in known_quantities(rows)],
+        coverage_plots=[
+            Markup(plot)
+            for plot in (coverage_plot(rows), width_plot(rows), decile_plot(rows, LEVEL))
+        ],
+        left_out=left_out_words(rows),
+        shown=shown,
+        band=band_strip(pictures[shown]),
+        scanline=Markup(scanline_plot(pictures[shown], shown)),
         strips=_strips(pictures),
     )
     write_atomic(path, lambda file: file.write(text.encode()))
@@ -63,6 +75,8 @@ def _strips(pictures: dict[str, dict[str, np.ndarray]]) -> list[dict]:
     """For each model and view: truth, render, error and uncertainty on a scale of its own."""
     strips = []
     for model, arrays in pictures.items():
+        if "names" not in arrays:  # no pictures were asked for
+            continue
         top = np.percentile(arrays["uncertainty"], 99.0)
         for i, name in enumerate(arrays["names"]):
             shown = (

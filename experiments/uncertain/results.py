@@ -1,20 +1,98 @@
-"""The result file of `evaluate_uncertainty`, and its table."""
+"""The result file of `evaluate_uncertainty`: where its parts are, and numbers out of it."""
 
 from __future__ import annotations
 
+import json
 import pathlib
 
 import numpy as np
 
-from experiments.report import stats
-from experiments.report.tables import Cell, Table, dash, interval_cell
+from experiments.report import ReportError
 
+SCHEMA_VERSION = 2  # of uncertainty.json
+ROW_VERSION = 2  # of one model and seed; rows of another version are made anew
+NAME = "uncertainty.json"
 FIELDS = {"own": "the model's own field", "common": "one common field"}
+QUANTITIES = {"depth": "scene units", "colour": "of 0 to 1"}  # that have intervals, and the unit
 
 
 def row_path(folder: pathlib.Path, model: str, seed: int) -> pathlib.Path:
     """Where the numbers of one model and seed are kept as soon as they are known."""
     return folder / "uncertainty" / model / f"seed_{seed}.json"
+
+
+def load_result(folder: pathlib.Path) -> dict:
+    """`uncertainty.json` of a folder.
+
+    Raises:
+      ReportError: the file is missing or broken, or of another version.
+    """
+    path = folder / NAME
+    try:
+        result = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ReportError(f"{path}: no such file; give the --workdir of an evaluation") from None
+    except json.JSONDecodeError as error:
+        raise ReportError(f"{path}: not JSON ({error}); run the evaluation again") from None
+    if result.get("schema_version") != SCHEMA_VERSION:
+        raise ReportError(
+            f"{path}: schema_version is {result.get('schema_version')}, this program reads "
+            f"{SCHEMA_VERSION}; run the evaluation again"
+        )
+    if not result.get("rows"):
+        raise ReportError(f"{path}: rows: there are none; run the evaluation again")
+    return result
+
+
+def title(result: dict) -> str:
+    """What was measured, in plain words."""
+    rows, config = result["rows"], result["config"]
+    width, height = result["image_size"]
+    # The scene that comes with the project is called like its loader.
+    scene = config["scene"] if result["kind"] == result["scene"] else result["scene"]
+    kind = {"procedural": "procedural scene", "blender": "NeRF-synthetic scene"}
+    kind = kind.get(result["kind"], f"scene of the {result['kind']} layout")
+    seeds = sorted({row["seed"] for row in rows})
+    views = sorted({row["num_views"] for row in rows})
+    views = f"{views[0]}" if len(views) == 1 else f"{views[0]} to {views[-1]}"
+    seeds = f"{len(seeds)} seed{'s' * (len(seeds) > 1)} ({', '.join(map(str, seeds))})"
+    steps = config["train"]["num_steps"]
+    return (
+        f"{scene} ({kind}, {width} x {height} pixels), {views} training views, {steps} optimiser "
+        f"steps, {seeds}"
+    )
+
+
+def split_words(result: dict) -> str:
+    """How many views fit, calibrate and test the intervals, in words."""
+    splits = result["interval_views"].values()
+    counts = []
+    for name in ("fit", "calibration", "test"):
+        numbers = sorted({len(split[name]) for split in splits})
+        counts.append("/".join(map(str, numbers)))
+    return (
+        f"{counts[0]} views fit the scale, {counts[1]} calibrate and {counts[2]} test, none of "
+        "them trained on, drawn at random for each seed"
+    )
+
+
+def left_out_words(rows: list[dict]) -> str:
+    """How many test pixels have no interval, and how wrong they are, of the first model."""
+    model, parts = rows[0]["model"], []
+    for quantity in known_quantities(rows):
+        share, error = (
+            [row["intervals"][quantity][key] for row in rows if row["model"] == model]
+            for key in ("share_with_band", "error_without_band")
+        )
+        known = [value for value in error if value is not None]
+        mean = f", mean error {np.mean(known):.3g} {QUANTITIES[quantity]}" if known else ""
+        parts.append(f"{quantity} {1.0 - np.mean(share):.1%}{mean}")
+    return f"Pixels with a known truth but without an interval ({model}): {'; '.join(parts)}."
+
+
+def models_of(rows: list[dict]) -> list[str]:
+    """Each model once, in the order of the rows."""
+    return list(dict.fromkeys(row["model"] for row in rows))
 
 
 def known_variants(rows: list[dict]) -> list[str]:
@@ -24,46 +102,24 @@ def known_variants(rows: list[dict]) -> list[str]:
     return [name for name in (rows[0]["own"] if rows else ()) if name in common]
 
 
+def known_quantities(rows: list[dict]) -> list[str]:
+    """What every row has intervals of."""
+    return [q for q in QUANTITIES if all(q in row["intervals"] for row in rows)]
+
+
 def values(rows: list[dict], model: str, field: str, variant: str, key: str = "ause") -> dict:
     """By seed, one number of a model."""
-    return {row["seed"]: row[field][variant][key] for row in rows if row["model"] == model}
+    return {
+        row["seed"]: row[field][variant][key]
+        for row in rows
+        if row["model"] == model and variant in row[field]
+    }
 
 
-def ause_table(rows: list[dict], variant: str, *, first: str | None = None) -> Table:
-    """AUSE of each model on its own field and on the common one, both normalisations.
-
-    Args:
-      rows: of the result file.
-      variant: which AUSE.
-      first: the model that others are compared with, seed by seed; the first one by default.
-    """
-    models = list(dict.fromkeys(row["model"] for row in rows))
-    first = first or models[0]
-    head = ["model", "seeds", "PSNR of its field (dB)"]
-    head += [f"AUSE, {words}" for words in FIELDS.values()]
-    head += ["unnormalised, common field", f"minus {first}, common field"]
-    table = []
-    for model in models:
-        mine = [row for row in rows if row["model"] == model]
-        psnr = stats.mean_interval(row["psnr"] for row in mine)
-        cells = [Cell(model), Cell(str(len(mine))), interval_cell(psnr, 2, "")]
-        for field in FIELDS:
-            found = stats.mean_interval(values(rows, model, field, variant).values())
-            cells.append(interval_cell(found, 3, ""))
-        plain = values(rows, model, "common", variant, "unnormalised")
-        cells.append(interval_cell(stats.mean_interval(plain.values()), 4, ""))
-        cells.append(_difference(rows, model, first, variant))
-        table.append(tuple(cells))
-    return Table(tuple(head), tuple(table))
-
-
-def _difference(rows, model: str, first: str, variant: str) -> Cell:
-    if model == first:
-        return dash("a model does not differ from itself")
-    ours, theirs = (values(rows, name, "common", variant) for name in (first, model))
-    seeds = sorted(ours.keys() & theirs.keys())
-    gap = stats.mean_interval(theirs[s] - ours[s] for s in seeds)
-    return interval_cell(gap, 3, f"{model} and {first} share no seed", gap=True)
+def interval_values(rows: list[dict], model: str, quantity: str, key: str) -> np.ndarray:
+    """One measure of `coverage_report` [seeds, L, ...] of a model; NaN where it is infinite."""
+    found = [row["intervals"][quantity][key] for row in rows if row["model"] == model]
+    return np.array(found, np.float64)
 
 
 def mean_curves(arrays: list[dict], field: str, variant: str) -> tuple[np.ndarray, np.ndarray]:
