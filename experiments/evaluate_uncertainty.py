@@ -27,12 +27,11 @@ from experiments import runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
 from experiments.errors import USER_ERRORS, check_choice
-from experiments.files import write_json
 from experiments.machine import device_name, versions
 from experiments.uncertain import intervals
 from experiments.uncertain.one_seed import measure_seed
 from experiments.uncertain.page import write_page
-from experiments.uncertain.results import NAME, SCHEMA_VERSION, row_path
+from experiments.uncertain.results import NAME, SCHEMA_VERSION, row_path, save_result
 
 FLAGS = flags.FLAGS
 config_flags.DEFINE_config_file(
@@ -78,7 +77,7 @@ def evaluate(config, folder: pathlib.Path, command: str) -> None:
         "interval_views": interval_views,
         "rows": rows,
     }
-    write_json(folder / NAME, result)
+    save_result(folder, result)
     arrays = {
         model: [dict(np.load(row_path(folder, model, s).with_suffix(".npz"))) for s in seeds]
         for model in models

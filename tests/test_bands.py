@@ -35,7 +35,9 @@ def make_calibration(rng, *, num_views=40, factor=1.0, shape=SHAPE):
     for _ in range(2):
         views = [make_image(rng, shape) for _ in range(num_views)]
         depth = [band_errors("depth", i, factor * d, depth_factor=factor) for i, d, _ in views]
-        groups.append({"colour": [band_errors("colour", i, c) for i, _, c in views], "depth": depth})
+        groups.append(
+            {"colour": [band_errors("colour", i, c) for i, _, c in views], "depth": depth}
+        )
     return calibrate_renders(*groups, depth_factor=factor)
 
 

@@ -5,14 +5,15 @@ import os
 import pathlib
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
 
 from bavs_jax.metrics.ause import sparsification
 from experiments.uncertain import measure
-from experiments.uncertain.results import known_variants, mean_curves
-from experiments.uncertain.tables import ause_table
+from experiments.uncertain.calibration_file import calibration_path, load_calibration
+from experiments.uncertain.results import mean_curves, row_path
 from tests.toy_runs import toy_flags
 from tests.toy_scenes import toy_scene
 
@@ -95,29 +96,6 @@ def test_depth_has_an_uncertainty_of_its_own_where_the_model_gives_one():
     assert found["colour_mae_per_image"].ause == expected > 0.0
 
 
-def make_rows():
-    def row(model, seed, own, common):
-        numbers = {"depth_mae_pooled": {"ause": own, "unnormalised": own / 10}}
-        shared = {"depth_mae_pooled": {"ause": common, "unnormalised": common / 10}}
-        return {"model": model, "seed": seed, "psnr": 20.0 + seed, "own": numbers, "common": shared}
-
-    return [
-        *(row("laplace", seed, 0.2, 0.2 + 0.01 * seed) for seed in (0, 1)),
-        *(row("entropy", seed, 0.4, 0.5 + 0.01 * seed) for seed in (0, 1)),
-        row("cf_nerf", 7, 0.1, 0.3),
-    ]
-
-
-def test_table_is_paired_by_seed():
-    rows = make_rows()
-    assert known_variants(rows) == ["depth_mae_pooled"]
-    table = ause_table(rows, "depth_mae_pooled")
-    cells = {row[0].text: row for row in table.rows}
-    assert cells["entropy"][-1].text == "+0.300 ± 0.000"
-    assert cells["laplace"][-1].text == "—" and cells["cf_nerf"][-1].why.endswith("share no seed")
-    assert cells["laplace"][2].text == "20.50 ± 6.35"  # 12.706 / sqrt(2) * sqrt(0.5)
-
-
 def test_mean_curves_are_shares_of_each_seeds_largest():
     arrays = [
         {
@@ -137,17 +115,22 @@ def finished(tmp_path_factory):
     return base, *run(base, models="('laplace','learned_variance')")
 
 
-def run(base, *, models):
+def start(base, *, models):
     flags = toy_flags(num_rounds=1, evaluation__num_views=2, evaluation__models=models)
-    done = subprocess.run(
+    return subprocess.Popen(
         [sys.executable, "-m", "experiments.evaluate_uncertainty", f"--workdir={base}", *flags],
         cwd=ROOT,
         env=os.environ | {"XDG_CACHE_HOME": str(base)},
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
-        timeout=300,
     )
-    return done.returncode, done.stdout, done.stderr
+
+
+def run(base, *, models):
+    process = start(base, models=models)
+    out, err = process.communicate(timeout=300)
+    return process.returncode, out, err
 
 
 def test_script_writes_numbers_curves_and_a_page(finished):
@@ -155,26 +138,74 @@ def test_script_writes_numbers_curves_and_a_page(finished):
     assert code == 0, err
     result = json.loads((base / "uncertainty.json").read_text())
     assert [row["model"] for row in result["rows"]] == ["laplace", "learned_variance"]
+    assert result["seeds"] == [0] and "evaluate_uncertainty" in result["command"]
+    assert {"jax", "bavs_jax", "python"} <= result["versions"].keys()
     for row in result["rows"]:
         assert row["num_views"] == 4 and len(row["own"]) == len(row["common"]) == 12
         assert all(np.isfinite([n["ause"], n["unnormalised"]]).all() for n in row["own"].values())
     first, second = result["rows"]
     assert first["own"] == first["common"]  # a measure on the common field itself
     assert second["own"] != second["common"]
+    assert first["psnr"] == first["psnr_common"] == second["psnr_common"] != second["psnr"]
     page = (base / "uncertainty.html").read_text()
-    assert page.count("<svg ") == 2 and "learned_variance" in page
-    assert page.count("<img ") == 2 * 4 and "remaining" in out
+    assert page.count("<svg ") == 2 + 3 + 1 and "learned_variance" in page
+    assert page.count("<img ") == 2 * 4 + 4 and "remaining" in out
+    assert "sculpture (procedural scene, 16 x 16 pixels), 4 training views" in page
 
 
-def test_more_models_are_added_to_what_is_there(finished):
+def test_intervals_are_of_views_that_nothing_was_trained_on(finished):
     base, *_ = finished
-    before = (base / "uncertainty" / "laplace" / "seed_0.json").stat().st_mtime_ns
-    code, out, err = run(base, models="('laplace','learned_variance','entropy')")
+    result = json.loads((base / "uncertainty.json").read_text())
+    split = result["interval_views"]["0"]
+    sizes = [len(split[name]) for name in ("fit", "calibration", "test")]
+    views = set().union(*split.values())
+    # 25 test views and the 96 of the pool that were not trained on.
+    assert sum(sizes) == len(views) == 121 and sizes[1] >= 48
+    summary = json.loads((base / "bavs" / "seed_0" / "result.json").read_text())
+    trained = set().union(*(one["selected"] for one in summary["rounds"]))
+    assert len(trained) == 4 and not views & trained
+    for row in result["rows"]:
+        for numbers in row["intervals"].values():
+            assert numbers["num_calibration_views"] <= sizes[1]
+            coverage, stderr = (np.array(numbers[k]) for k in ("coverage", "coverage_stderr"))
+            expected = np.array(numbers["levels"])
+            # 5 standard errors of the test views, and as much again for the calibration views.
+            slack = 5.0 * np.sqrt(2.0) * np.maximum(stderr, 0.01)
+            assert (np.abs(coverage - expected) < slack + 1.0 / sizes[1]).all()
+
+
+def test_saved_intervals_give_the_bands_of_the_page(finished):
+    base, *_ = finished
+    calibration = load_calibration(calibration_path(base, "laplace", 0))
+    with np.load(base / "uncertainty" / "laplace" / "seed_0.npz") as file:
+        half, quantity = file["band_half"], str(file["band_quantity"])
+    assert quantity == "depth" and np.isfinite(half).any()
+    factor = calibration.depth.factors[list(calibration.depth.levels).index(0.9)]
+    # All widths lie between those at the ends of the scale; single precision in the file.
+    ends = factor * (calibration.depth.scale.values[[0, -1]] + calibration.depth.scale.floor)
+    known = half[np.isfinite(half)]
+    assert (known >= ends[0] * (1 - 1e-6)).all() and (known <= ends[1] * (1 + 1e-6)).all()
+
+
+def test_a_killed_evaluation_goes_on_and_does_nothing_twice(finished):
+    base, *_ = finished
+    models = ("laplace", "learned_variance", "entropy", "ensemble")
+    done = [row_path(base, model, 0) for model in models[:3]]
+    process = start(base, models=str(models).replace(" ", ""))
+    deadline = time.monotonic() + 300.0
+    while not done[-1].exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.kill()
+    process.communicate()
+    assert done[-1].exists()
+    before = [path.stat().st_mtime_ns for path in done]
+    code, out, err = run(base, models=str(models).replace(" ", ""))
     assert code == 0, err
-    assert (base / "uncertainty" / "laplace" / "seed_0.json").stat().st_mtime_ns == before
-    assert "train on" not in out
+    assert [path.stat().st_mtime_ns for path in done] == before
+    for words in ("train on", "train variance", "laplace", "entropy", "learned_variance"):
+        assert words not in out
     rows = json.loads((base / "uncertainty.json").read_text())["rows"]
-    assert [row["model"] for row in rows] == ["laplace", "learned_variance", "entropy"]
+    assert [row["model"] for row in rows] == list(models)
 
 
 def test_an_unknown_model_ends_in_one_line(finished):

@@ -141,7 +141,7 @@ def to_json(value):
     For `Calibrated` and `CoverageReport`: JSON has no infinity. A half-width or width of None was
     promised from too few views, or is relative to one that was.
     """
-    if isinstance(value, str):
+    if value is None or isinstance(value, str):
         return value
     if hasattr(value, "_asdict"):
         return {name: to_json(one) for name, one in value._asdict().items()}

@@ -7,6 +7,7 @@ import pathlib
 
 import numpy as np
 
+from experiments.files import write_atomic
 from experiments.report import ReportError
 
 SCHEMA_VERSION = 2  # of uncertainty.json
@@ -42,6 +43,23 @@ def load_result(folder: pathlib.Path) -> dict:
     if not result.get("rows"):
         raise ReportError(f"{path}: rows: there are none; run the evaluation again")
     return result
+
+
+def save_result(folder: pathlib.Path, result: dict) -> None:
+    """Writes `uncertainty.json`: six digits, one line for each row, so that it stays small."""
+    parts = {name: json.dumps(_rounded(value), allow_nan=False) for name, value in result.items()}
+    rows = [json.dumps(_rounded(row), allow_nan=False) for row in result["rows"]]
+    parts["rows"] = "[\n" + ",\n".join(rows) + "\n]"
+    text = ",\n".join(f"{json.dumps(name)}: {part}" for name, part in parts.items())
+    write_atomic(folder / NAME, lambda file: file.write(f"{{\n{text}\n}}\n".encode()))
+
+
+def _rounded(value):
+    if isinstance(value, dict):
+        return {name: _rounded(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(one) for one in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def title(result: dict) -> str:

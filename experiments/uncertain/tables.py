@@ -55,7 +55,7 @@ def summary_table(rows: list[dict], *, first: str = "laplace") -> Table:
     first = first if first in models else models[0]
     head = ["model", "measured on", "seeds", "PSNR of the field (dB)"]
     for of in SUMMARY:
-        head += [f"AUSE {of} MAE", f"minus {first}", f"AUSE {of} MAE, unnormalised"]
+        head += [f"AUSE {of} MAE", f"{of}: minus {first}", f"AUSE {of} MAE, unnormalised"]
     table = []
     for field, words in FIELDS.items():
         for model in models:
