@@ -12,12 +12,10 @@ not computed again: one may kill it and start it again. A folder that
 
 from __future__ import annotations
 
-import json
 import pathlib
 import sys
 import time
 
-import numpy as np
 from absl import flags
 from ml_collections import config_flags
 
@@ -27,11 +25,8 @@ from experiments import runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
 from experiments.errors import USER_ERRORS, check_choice
-from experiments.machine import device_name, versions
-from experiments.uncertain import intervals
 from experiments.uncertain.one_seed import measure_seed
-from experiments.uncertain.page import write_page
-from experiments.uncertain.results import NAME, SCHEMA_VERSION, row_path, save_result
+from experiments.uncertain.summary import write_summary
 
 FLAGS = flags.FLAGS
 config_flags.DEFINE_config_file(
@@ -57,36 +52,9 @@ def evaluate(config, folder: pathlib.Path, command: str) -> None:
     problem = build_problem(config, scene)
     for seed in config.seeds:
         measure_seed(config, problem, folder, seed, command)
-
-    models, seeds = config.evaluation.models, config.seeds
-    paths = [row_path(folder, model, seed) for model in models for seed in seeds]
-    rows = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
-    # The same for all models of a seed.
-    interval_views = {str(row["seed"]): row.pop("interval_views") for row in rows}
-    result = {
-        "schema_version": SCHEMA_VERSION,
-        "scene": scene.name,
-        "kind": config.loader,
-        "image_size": np.asarray(scene.cameras.sizes).max(axis=0).tolist(),
-        "seeds": list(seeds),
-        "command": command,
-        "config": config.to_dict(),
-        "device": device_name(),
-        "versions": versions(),
-        "pixel_rule": intervals.pixel_rule(config.evaluation.num_interval_pixels),
-        "interval_views": interval_views,
-        "rows": rows,
-    }
-    save_result(folder, result)
-    arrays = {
-        model: [dict(np.load(row_path(folder, model, s).with_suffix(".npz"))) for s in seeds]
-        for model in models
-    }
-    write_page(
-        folder / "uncertainty.html", result, arrays=arrays, variant=config.evaluation.variant
-    )
-    print(f"numbers: {folder / NAME}")
-    print(f"page:    {folder / 'uncertainty.html'}  ({time.monotonic() - start:.0f} s in all)")
+    numbers, page = write_summary(config, scene, folder, command)
+    print(f"numbers: {numbers}")
+    print(f"page:    {page}  ({time.monotonic() - start:.0f} s in all)")
 
 
 def main() -> None:
