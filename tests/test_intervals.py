@@ -24,8 +24,8 @@ from tests.toy_scenes import toy_scene
 SIZE = 6
 
 
-def scene_with_depth():
-    scene = toy_scene(size=SIZE)
+def scene_with_depth(size=SIZE):
+    scene = toy_scene(size=size)
     depth = np.random.default_rng(0).uniform(1.0, 4.0, len(scene.pixels)).astype(np.float32)
     return dataclasses.replace(scene, depth=depth)
 

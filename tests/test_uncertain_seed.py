@@ -1,4 +1,4 @@
-"""One seed of the evaluation with made-up fields: killed anywhere, it goes on and repeats nothing."""
+"""One seed of the evaluation with made-up fields: killed anywhere, it repeats nothing."""
 
 import dataclasses
 import json
@@ -42,12 +42,12 @@ def make_render(model: str):
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     """Config, problem, folder, and a list that fits and renders of whole views are noted in."""
-    scene, log = scene_with_depth(), []
+    scene, log = scene_with_depth(size=12), []
     is_training_view = np.isin(np.arange(scene.num_views), (0, 1))
 
     def trained(config, problem, folder, seed, command):
         log.append(f"train {seed}")
-        return Situation({}, None, is_training_view, 72, label=f"seed {seed}")
+        return Situation({}, None, is_training_view, 288, label=f"seed {seed}")
 
     def fit(problem, name, key, situation):
         log.append(f"fit {name}")
@@ -118,7 +118,7 @@ def test_result_and_page_of_two_seeds(place):
         assert shown["share_with_band"] < 1.0 and shown["error_without_band"] > 0.0
     text = page.read_text()
     assert text.count("<svg ") == 2 + 3 + 1 and text.count("<img ") == 3 * 4 + 4
-    assert "ball (procedural scene, 6 x 6 pixels), 2 training views, 24 optimiser steps" in text
+    assert "ball (procedural scene, 12 x 12 pixels), 2 training views, 24 optimiser steps" in text
 
 
 def test_page_of_a_scene_without_depth(place):
