@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.cameras import Cameras, take
@@ -15,6 +16,7 @@ from bavs_jax.candidates import Candidates
 from bavs_jax.fields.deformation import vertices_in_box
 from bavs_jax.selection.information import Information, make_cached_curvature_fn
 from bavs_jax.selection.policy import Policy
+from bavs_jax.selection.directional import Directional
 from bavs_jax.uncertainty.model import ModelFns, Situation, Toolbox
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
@@ -107,6 +109,22 @@ def make_sources_fn(
         )
         return Information(precision, curvature_fn)
 
+    def make_directional(key, situation, candidates, seconds):
+        rows = np.flatnonzero(situation.is_training_view)
+        taken = take(situation.table.cameras, rows)
+        fn = lambda c: make_cached_curvature_fn(make_candidate_curvature_fn(toolbox, situation, c, options.image_scale),
+            num_vertices=toolbox.grid.num_vertices, max_bytes=options.cache_bytes, group_size=toolbox.group_size)
+        cfn, tfn = fn(candidates.cameras), fn(taken)
+        with _clock(seconds, "curvature"):
+            looks = [(*rh, np.asarray(q)) for rh, q in zip(tfn(range(len(rows))), np.asarray(taken.positions))]
+        known = {}
+        with _clock(seconds, "score"):
+            ids = np.flatnonzero(candidates.mask)
+            for i, (r, h) in zip(ids, cfn(ids)):
+                known[int(i)] = jnp.zeros_like(h)
+        d = Directional(known, cfn, np.asarray(candidates.cameras.positions), toolbox, looks)
+        return d
+
     def sources(policy: Policy, key, situation: Situation, candidates: Candidates) -> Sources:
         seconds = dict.fromkeys(("curvature", "fit", "score"), 0.0)
         makers = {
@@ -115,6 +133,7 @@ def make_sources_fn(
             ),
             "information": lambda: make_information(key, situation, candidates, seconds),
         }
+        makers["directional"] = lambda: make_directional(key, situation, candidates, seconds)
         if true_error_fn is not None:
             makers["true_error_fn"] = lambda: (
                 lambda indices: true_error_fn(situation.train, candidates.view_ids[indices])

@@ -39,6 +39,7 @@ class Context:
     mean_uncertainty_fn: Callable | None = struct.field(pytree_node=False, default=None)
     # The posterior of the field and what each candidate would add to it (`information.py`).
     information: Any = struct.field(pytree_node=False, default=None)
+    directional: Any = struct.field(pytree_node=False, default=None)
     # Candidate indices int [n] -> mean squared error of their renders against their photos [n].
     true_error_fn: Callable | None = struct.field(pytree_node=False, default=None)
 
@@ -53,6 +54,7 @@ def make_context(
     mask=None,
     mean_uncertainty_fn: Callable | None = None,
     information: Any = None,
+    directional: Any = None,
     true_error_fn: Callable | None = None,
 ) -> Context:
     """Checks and builds a `Context`, on the host.
@@ -102,6 +104,7 @@ def make_context(
         picked=np.zeros(num, bool),
         mean_uncertainty_fn=mean_uncertainty_fn,
         information=information,
+        directional=directional,
         true_error_fn=true_error_fn,
     )
 

@@ -1,0 +1,19 @@
+
+from functools import partial
+from bavs_jax.selection.context import require, score_candidates
+from bavs_jax.selection.directional import gains, add, first
+from bavs_jax.selection.policy import Policy
+_memo = {}
+def start(ctx):
+    d = require(ctx, "directional")
+    if d.done: return d
+    if _memo.get("key") is not d.looks:
+        _memo["key"] = d.looks; _memo["value"] = first(d, 8.0)
+    return _memo["value"]
+def score(key, ctx):
+    del key
+    cov = score_candidates(ctx, lambda i: require(ctx, "mean_uncertainty_fn")(i, ctx.picked))
+    return cov * score_candidates(ctx, partial(gains, start(ctx), power=8.0, prior=7.6e-10))
+def update(ctx, index):
+    return ctx.replace(directional=add(start(ctx), index, 8.0))
+POLICY = Policy(name="covdir8", summary="try", score_fn=score, update_fn=update, needs=frozenset({"directional","mean_uncertainty_fn"}), mode="greedy", uncertainty="coverage")

@@ -1,0 +1,108 @@
+"""Coverage (CONVERGE): from how new a direction does a ray look at what it meets?"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bavs_jax.cameras import Cameras
+from bavs_jax.rendering.pixels import basic_images, render_pixels
+from bavs_jax.rendering.render import Channel
+from bavs_jax.uncertainty.models.laplace import training_curvature
+from bavs_jax.uncertainty.channel import finish_uncertainty, make_uncertainty_channel, vertex_variance
+from bavs_jax.uncertainty.coverage import direction_novelty
+from bavs_jax.uncertainty.images import make_image_fn, render_stack
+from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
+
+
+class Covered(NamedTuple):
+    """Who has seen the scene: V views and C candidates, of which only the marked ones count."""
+
+    cameras: Cameras  # [V + C]
+    mask: np.ndarray  # [V + C] bool
+    depth_maps: np.ndarray  # [V + C, H, W] scene units, 0 where empty
+    variance: jax.Array = None
+
+
+def make_fns(toolbox: Toolbox) -> ModelFns:
+    """Depth maps of the training views are fitted, so that a view covers only what it sees."""
+    field, sampler = toolbox.fields[toolbox.kind]
+    lap = toolbox.laplace
+    depth_images = make_image_fn(toolbox, toolbox.kind)
+
+    @jax.jit
+    def images(params, sampler_state, covered, rays):
+        novelty = partial(
+            direction_novelty,
+            cameras=covered.cameras,
+            mask=covered.mask,
+            depth_maps=covered.depth_maps,
+        )
+        base = make_uncertainty_channel(toolbox.grid, covered.variance, variant=lap.variant, scale=lap.scale, extent=lap.extent).value_fn
+        def value(positions, directions):
+            return novelty(positions, directions) * finish_uncertainty(base(positions, directions), scale=lap.scale)
+        rendering, samples = render_pixels(
+            field,
+            sampler,
+            params,
+            sampler_state,
+            rays,
+            background=toolbox.background,
+            capacity=toolbox.capacity,
+            channels={"uncertainty": Channel(value)},
+        )
+        return {**basic_images(rendering, samples), **rendering.channels}
+
+    def look(train, cameras, mask):
+        return render_stack(
+            partial(depth_images, train),
+            cameras,
+            mask,
+            scale=toolbox.image_scale,
+            chunk=toolbox.chunk,
+            names=("depth",),
+        )
+
+    def fit(key, situation):
+        jac = training_curvature(key, toolbox, situation, lap.weighting)
+        variance = vertex_variance(jac, num_rays=situation.num_rays, prior_weight=lap.prior_weight, weighting=lap.weighting, variant=lap.variant)
+        cameras = jax.tree.map(
+            lambda a, b: jnp.concatenate([a, b]), situation.table.cameras, situation.candidates
+        )
+        unused = np.zeros(len(situation.candidates), bool)
+        mask = np.concatenate([np.asarray(situation.is_training_view), unused])
+        small, depth_maps = look(situation.train, cameras, mask)
+        return Covered(small, mask, depth_maps, variance)
+
+    def condition(covered, train, picked):
+        mask = covered.mask.copy()
+        mask[-len(picked) :] = picked
+        new = mask & ~covered.mask
+        if not new.any():
+            return covered
+        # Already reduced: look at them as they are.
+        images = render_stack(
+            partial(depth_images, train),
+            covered.cameras,
+            new,
+            scale=1.0,
+            chunk=toolbox.chunk,
+            names=("depth",),
+        )
+        return covered._replace(mask=mask, depth_maps=covered.depth_maps + images[1])
+
+    def render(covered, train, rays):
+        return images(train.params, train.sampler_state, covered, rays)
+
+    return ModelFns(fit, render, condition)
+
+
+MODEL = UncertaintyModel(
+    name="novel_laplace",
+    summary="How new the direction is from which each point is looked at.",
+    make_fns=make_fns,
+)
