@@ -103,7 +103,7 @@ def test_summary_has_a_row_for_each_model_and_field():
     assert own["entropy"]["AUSE depth MAE"] == "0.400 ± 0.000"
     assert own["entropy"]["depth: minus laplace"] == "+0.200 ± 0.000"
     assert own["cf_nerf"]["PSNR of the field (dB)"] == "27.00"
-    assert [row[1].text for row in common] == ["one common field"] * 3
+    assert [row[1].text for row in common] == ["common field"] * 3
     assert common[1][3].text == "22.00 ± 0.00" and common[1][5].text == "+0.300 ± 0.000"
 
 

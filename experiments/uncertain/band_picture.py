@@ -33,7 +33,7 @@ def band_arrays(scene, calibration: RenderCalibration, view: int, image: dict) -
     mask = scene.mask_image(view)
     if mask is not None:
         truth = np.where(mask, truth, np.nan)
-    arrays = {"value": np.where(np.isfinite(half), value, np.nan), "half": half, "truth": truth}
+    arrays = {"value": np.where(np.isnan(half), np.nan, value), "half": half, "truth": truth}
     arrays = {f"band_{name}": x.astype(np.float32) for name, x in arrays.items()}
     return arrays | {"band_name": np.array(scene.names[view]), "band_quantity": np.array(quantity)}
 
@@ -47,7 +47,7 @@ def band_strip(arrays: dict[str, np.ndarray]) -> dict:
     top = max(_ends(half, 2.0)[1], 1e-12)
     known = np.isfinite(error)
     verdict = np.where(known, np.where(error <= half, 0, 1), 2)
-    share = np.mean(error[known] <= half[known]) if known.any() else np.nan
+    share = f"{np.mean(error[known] <= half[known]):.1%}" if known.any() else "no pixel"
     shown = (
         (
             f"rendered {quantity}, {low:.2f} (dark) to {high:.2f} (bright) {unit}",
@@ -59,7 +59,7 @@ def band_strip(arrays: dict[str, np.ndarray]) -> dict:
         ),
         ("error, on the scale of the half-width", colourise(error, 0.0, top, UNCERTAINTY_MAP)),
         (
-            f"truth inside (blue, {share:.1%}) or outside (vermilion)",
+            f"truth inside (blue, {share}) or outside (vermilion)",
             np.array([INSIDE, OUTSIDE, UNKNOWN], np.uint8)[verdict],
         ),
     )

@@ -53,12 +53,14 @@ def width_plot(rows: list[dict]) -> str:
         levels = rows[0]["intervals"][quantity]["levels"]
         for axes, (key, words) in zip(column, names):
             axes.axhline(1.0, color=plots.BLACK, linewidth=1.2, linestyle="--")
+            top = 1.0
             for model, colour, marker, x in _positions(rows, levels):
                 ratios = interval_values(rows, model, quantity, key)
                 axes.plot(*(x, ratios.mean(0)), marker, color=colour, markersize=6, label=model)
                 axes.vlines(x, ratios.min(0), ratios.max(0), color=colour, linewidth=1.4)
+                top = np.nanmax([top, *ratios.ravel()])
             axes.set_title(f"{quantity}: {words}", fontsize=10.5, loc="left")
-            axes.set_ylim(0.0, None)
+            axes.set_ylim(0.0, 1.08 * top)
             _level_axis(axes, levels)
         column[-1].set_xlabel("nominal level", **LABEL)
     for axes in panels[:, 0]:
