@@ -55,7 +55,7 @@ def test_each_vertex_has_the_variance_of_its_posterior():
     np.testing.assert_allclose(theta.var(0), want, rtol=5 * np.sqrt(2 / num))
     # And that of a mean is sd / sqrt(num).
     assert (np.abs(theta.mean(0)) < 5 * np.sqrt(want / num)).all()
-    # Vertices and axes are drawn by themselves: a correlation has a standard error of 1 / sqrt(num).
+    # Vertices and axes are drawn by themselves: correlations have a standard error of num^-0.5.
     correlation = np.corrcoef(np.asarray(theta).reshape(num, -1).T) - np.eye(60)
     assert np.abs(correlation).max() < 5 / np.sqrt(num)
 

@@ -109,7 +109,7 @@ def test_runs_that_cannot_be_used_are_errors(finished, tmp_path):
     folder, _ = finished
     with pytest.raises(WorkdirError, match=r"config\.json: is missing"):
         load_run(tmp_path)
-    with pytest.raises(WorkdirError, match="one of the finished runs: .*random/seed_0"):
+    with pytest.raises(WorkdirError, match=r"one of the finished runs: .*random/seed_0"):
         load_run(folder, seed=7)
     (tmp_path / "config.json").write_text('{"no_such_option": 1}')
     with pytest.raises(WorkdirError, match="cannot be read"):
