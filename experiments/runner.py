@@ -73,6 +73,10 @@ class Run:
             state = self._one_step(step, state)
         self.checkpoints.close()
 
+    def state(self) -> ActiveState:
+        """The state of the last checkpoint, or a fresh one."""
+        return self._start(None)
+
     # --- one round ---
 
     def _is_trained(self, state: ActiveState) -> bool:
