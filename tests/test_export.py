@@ -323,7 +323,7 @@ def run_folder(tmp_path_factory):
 def export(folder, *flags, cache):
     command = [sys.executable, "-m", "experiments.export_field", f"--workdir={folder}", *flags]
     env = os.environ | {"XDG_CACHE_HOME": str(cache), "JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
-    return subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=300)
+    return subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=3000)
 
 
 def test_script_writes_files_that_agree_with_the_field(run_folder, tmp_path):

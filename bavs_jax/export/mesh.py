@@ -45,7 +45,7 @@ def extract_mesh(density, axes, *, threshold: float, closed: bool):
     measure, trimesh = import_extra("skimage.measure"), import_extra("trimesh")
     if not threshold > 0.0:
         raise ExportError(f"density threshold: is {threshold:.4g}: give a number above 0")
-    density = np.asarray(density, np.float64)
+    density = np.asarray(density, np.float32)
     solid = 1.0 - np.exp2(-density / threshold)
     corner = np.array([axis[0] for axis in axes])
     steps = np.array([axis[1] - axis[0] for axis in axes])
