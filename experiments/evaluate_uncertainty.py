@@ -20,7 +20,6 @@ import numpy as np
 from absl import flags
 from ml_collections import config_flags
 
-from bavs_jax.uncertainty.model import Situation
 from bavs_jax.uncertainty.models import MODELS
 from experiments import runtime, workdir
 from experiments.build import Problem, build_problem, run_key
@@ -29,7 +28,7 @@ from experiments.errors import USER_ERRORS, check_choice
 from experiments.evaluate import mean_quality, spread_evenly
 from experiments.files import write_arrays, write_json
 from experiments.machine import device_name
-from experiments.runner import Run
+from experiments.trained import FIRST_ROUND, train_run
 from experiments.uncertain import measure
 from experiments.uncertain.page import write_page
 from experiments.uncertain.results import row_path
@@ -50,16 +49,9 @@ SCHEMA_VERSION = 1
 
 def trained_situation(config, problem: Problem, folder: pathlib.Path, seed: int, command: str):
     """The field of a seed at the end of its run of the config's first policy."""
-    first = Run(config, problem, folder, None, seed, command)
-    first.finish()
-    policy = config.policies[0] if config.num_rounds else None
-    if policy is not None:
-        Run(config, problem, folder, policy, seed, command).finish(first)
-    state = Run(config, problem, folder, policy, seed, command).state()
-    num_rays = int(np.diff(problem.scene.offsets)[first.initial].sum())
-    return Situation(
-        *(state.train, state.table, state.is_training_view, num_rays), label=f"seed {seed}"
-    )
+    policy = config.policies[0] if config.num_rounds else FIRST_ROUND
+    run = train_run(config, problem, folder, policy, seed, command)
+    return run.situation._replace(label=f"seed {seed}")
 
 
 def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, command: str) -> None:

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import platform
 import resource
 import sys
 
 import jax
+
+PACKAGES = ("bavs_jax", "jax", "jaxlib", "flax", "optax", "numpy")
+
+
+def package_versions() -> dict[str, str]:
+    """The versions that numbers may depend on."""
+    versions = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return versions | {"python": platform.python_version()}
 
 
 def device_name() -> str:

@@ -1,27 +1,25 @@
-"""Scenes that the photos allow (Fig 3): draws offsets from a run's posterior and renders them.
+"""Scenes that the photos allow (Fig 3): draws offsets from a posterior and renders them.
 
     python -m experiments.posterior_draws --workdir=runs/quickstart
+    python -m experiments.posterior_draws --config=experiments/configs/quickstart.py --workdir=NEW
 
-What the photos show stays where it is, and what they do not settle moves. Writes draws.json, with
-how far pixels move in training views and in test views, and draws.png into
-WORKDIR/<policy>/seed_<n>/draws.
+The first takes up the runs of a folder; the second trains first. What the photos show stays where
+it is, and what they do not settle moves: WORKDIR/draws.json says how far pixels move in training
+views and in test views, and WORKDIR/<policy>/seed_<n>/draws/draws.png shows it.
 """
 
 from __future__ import annotations
 
 import pathlib
-import sys
 import time
 
 import numpy as np
 from absl import flags
 from matplotlib.figure import Figure
 
-from experiments import runtime
-from experiments.errors import USER_ERRORS, ConfigError
 from experiments.evaluate import spread_evenly
 from experiments.files import write_json
-from experiments.machine import device_name
+from experiments.posthoc import script
 from experiments.posthoc.draws import (
     ViewDraws,
     draw_views,
@@ -30,41 +28,43 @@ from experiments.posthoc.draws import (
     spread_measures,
 )
 from experiments.posthoc.figures import Panel, panel_table, save_png
-from experiments.posthoc.trained_run import TrainedRun, load_run
+from experiments.trained import TrainedRun
 
-SCHEMA_VERSION = 1
 NUM_SHOWN = 3  # draws in the picture
 
 FLAGS = flags.FLAGS
-flags.DEFINE_string("workdir", None, "Folder of a finished run of experiments.active_selection.")
-flags.DEFINE_string("policy", "", "Whose field; the first of the run's by default.")
-flags.DEFINE_integer("seed", None, "Of the run; its first by default.")
+flags.adopt_module_key_flags(script)
 flags.DEFINE_integer("num_draws", 16, "Offsets drawn from the posterior.")
 flags.DEFINE_integer("num_views", 8, "Training views, and as many test views, that are rendered.")
 flags.DEFINE_float(
     "scale", 0.0, "Temperature of the draws; 0: what the training views' error says of the noise."
 )
 flags.DEFINE_float("limit", 0.1, "Largest offset, as a share of the sides of the scene box.")
-flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
 
 
-def check_flags() -> None:
-    """Raises ConfigError for a flag that cannot be used."""
-    for name, good, fix in (
+def draw_all() -> None:
+    """Draws, renders, measures and writes, run by run."""
+    start = time.monotonic()
+    script.check_flags(
         ("num_draws", FLAGS.num_draws >= 2, "give 2 or more"),
         ("num_views", FLAGS.num_views >= 1, "give 1 or more"),
         ("scale", FLAGS.scale >= 0.0, "give a number above 0, or 0 for the noise's own"),
         ("limit", 0.0 < FLAGS.limit <= 1.0, "give a share above 0 and up to 1"),
-    ):
-        if not good:
-            raise ConfigError(f"--{name}: {FLAGS[name].value!r} cannot be used: {fix}")
+    )
+    rows = []
+    for run in script.trained_runs():
+        rows.append(draw_run(run))
+        for name in ("training", "test"):
+            print(f"{name} views: {_in_words(rows[-1][name])}")
+        # Written after each run, so that a command that is stopped leaves what it has measured.
+        write_json(pathlib.Path(FLAGS.workdir) / "draws.json", script.result_file(run, rows))
+    print(f"numbers:  {pathlib.Path(FLAGS.workdir) / 'draws.json'}")
+    print(f"({time.monotonic() - start:.0f} s in all)")
 
 
-def draw_and_write(workdir: pathlib.Path) -> None:
-    """Draws, renders, measures and writes."""
+def draw_run(run: TrainedRun) -> dict:
+    """One run's numbers; writes its picture."""
     start = time.monotonic()
-    check_flags()
-    run = load_run(workdir, FLAGS.policy, FLAGS.seed)
     test = run.problem.scene.test
     far = farthest_view(run, test)
     seen = spread_evenly(run.training_views, FLAGS.num_views)
@@ -77,26 +77,17 @@ def draw_and_write(workdir: pathlib.Path) -> None:
         limit=largest_offset(run, FLAGS.limit),
     )
     split = {"training": views[: len(seen)], "test": views[len(seen) :]}
-    measures = {name: spread_measures(part) for name, part in split.items()}
-    folder = run.folder / "draws"
     shown = [split["training"][0], next(v for v in split["test"] if v.view_id == far)]
-    save_png(draws_figure(run, shown), folder / "draws.png")
-    value = {
-        "schema_version": SCHEMA_VERSION,
-        "scene": run.problem.scene.name,
-        "policy": run.policy,
-        "seed": run.seed,
-        "command": runtime.command_line(),
-        "device": device_name(),
+    path = run.folder / "draws" / "draws.png"
+    save_png(draws_figure(run, shown), path)
+    print(f"picture:  {path}")
+    return {
+        **script.about_run(run),
         "seconds": time.monotonic() - start,
         "options": {"num_draws": FLAGS.num_draws, "scale": scale, "limit": FLAGS.limit},
         "farthest_test_view": far,
-        **measures,
+        **{name: spread_measures(part) for name, part in split.items()},
     }
-    write_json(folder / "draws.json", value)
-    for name, part in measures.items():
-        print(f"{name} views: {_in_words(part)}")
-    print(f"results: {folder}  ({time.monotonic() - start:.0f} s in all)")
 
 
 def draws_figure(run: TrainedRun, views: list[ViewDraws]) -> Figure:
@@ -114,7 +105,7 @@ def draws_figure(run: TrainedRun, views: list[ViewDraws]) -> Figure:
             Panel("spread over draws", view.spread, "magma", (0.0, spread_top)),
         ]
         rows.append((name, panels))
-    return panel_table(rows, scale_label="spread over draws")
+    return panel_table(rows, scale_label="spread over draws (colours in [0, 1])")
 
 
 def _in_words(measures: dict) -> str:
@@ -126,16 +117,5 @@ def _in_words(measures: dict) -> str:
     return f"{words}, rank correlation with uncertainty {measures['rank_correlation']:.2f}"
 
 
-def main() -> None:
-    if not FLAGS.workdir:
-        sys.exit("error: --workdir: is missing; name the folder of a finished run")
-    if FLAGS.compilation_cache:
-        runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
-    try:
-        draw_and_write(pathlib.Path(FLAGS.workdir))
-    except USER_ERRORS as error:
-        sys.exit(f"error: {error}")
-
-
 if __name__ == "__main__":
-    runtime.run_script(main)
+    script.run_on_trained(draw_all)

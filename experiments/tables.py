@@ -5,11 +5,12 @@
 
 The first prints the tables of one experiment. The second writes every table of a page anew: each
 stands between `<!-- results: FOLDER -->` and `<!-- end of results -->`, where FOLDER holds a
-`summary.json` and is relative to the page.
+`summary.json`, or the result file of a script on a trained run, and is relative to the page.
 """
 
 from __future__ import annotations
 
+import json
 import pathlib
 import re
 import sys
@@ -18,6 +19,7 @@ from absl import flags
 
 from experiments import runtime
 from experiments.files import write_atomic
+from experiments.posthoc.tables import TABLES
 from experiments.report import ReportError
 from experiments.report.results import load_runs
 from experiments.report.tables import (
@@ -45,6 +47,23 @@ def markdown(table: Table) -> str:
 
 
 def result_tables(folder: pathlib.Path) -> str:
+    """The tables of a folder's `summary.json`, or else of what measures on trained runs left."""
+    found = [folder / name for name in TABLES if (folder / name).exists()]
+    if found and not (folder / "summary.json").exists():
+        return "\n".join(map(posthoc_tables, found))
+    return run_tables(folder)
+
+
+def posthoc_tables(path: pathlib.Path) -> str:
+    """The table of one result file over its seeds."""
+    result = json.loads(path.read_text(encoding="utf-8"))
+    num = len({row["seed"] for row in result["rows"]})
+    over = "1 seed" if num == 1 else f"means over {num} seeds ± half of the 95 % interval"
+    made = f"`{result['command']}` ({result['device']}; {over})"
+    return f"{made}\n\n{markdown(TABLES[path.name](result['rows']))}\n"
+
+
+def run_tables(folder: pathlib.Path) -> str:
     """Quality at the last shared number of views, and where the time went."""
     runs = load_runs(folder)
     policies = list(dict.fromkeys(run.policy for run in runs))

@@ -2,10 +2,6 @@
 
 import dataclasses
 import io
-import json
-import os
-import pathlib
-import subprocess
 import sys
 
 import jax.numpy as jnp
@@ -29,20 +25,11 @@ from bavs_jax.scenes.poses import scene_points, user_points, user_units
 from bavs_jax.training.batches import make_pixel_table, view_pixel_rays
 from bavs_jax.uncertainty.channel import make_uncertainty_channel
 from bavs_jax.uncertainty.points import make_point_fn
-from experiments import workdir
-from experiments.build import build_problem
-from experiments.build_scene import load_config_scene
-from experiments.errors import WorkdirError
-from experiments.progress import track
-from experiments.runner import Run
-from experiments.trained import fit_variance, load_trained, user_point_fn
 from tests.toy_fields import smooth_field, smooth_field_fn
-from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
-ROOT = pathlib.Path(__file__).parents[1]
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 0.5]])
 RNG = np.random.default_rng(0)
 TURNED = np.array(  # 2 times a quarter turn about z, and a shift
@@ -262,7 +249,7 @@ def test_cloud_holds_the_ends_of_rays_that_are_not_empty():
 
     def render(rays):
         depth = jnp.linalg.norm(rays.origins, axis=-1)
-        return {"rgb": 1.1 * rays.directions**2, "depth": depth, "opacity": rays.directions[:, 0]}
+        return {"rgb": 1.1 * rays.directions**2, "depth": depth, "opacity": rays.directions[:, 1]}
 
     rays = view_pixel_rays(table.cameras, views, within)
     keep = np.asarray(rays.directions[:, 0] >= 0.2)
@@ -297,93 +284,8 @@ def test_geometry_error_of_a_ball_of_another_size():
     # 4000 points on an area of pi: their spacing of about 0.5 sqrt(pi / 4000) = 0.014 adds to the
     # distance of 0.1 by no more than sqrt(0.1^2 + 0.028^2) - 0.1 = 0.004.
     np.testing.assert_allclose(error["whole"]["chamfer"], 0.1, atol=0.004)
-    assert error["whole"]["f_score"] == 0.0 and error["floor"]["f_score"] == 1.0
+    assert error["whole"]["f_score"] == 0.0 and error["floor"]["f_score"] > 0.99
     np.testing.assert_allclose(error["floor"]["chamfer"], 0.014, rtol=0.2)
     assert error["seen"]["accuracy"] > 0.09
     with pytest.raises(ValueError, match="has no true depth"):
         seen_by_any(toy_scene(), points[0])
-
-
-# --- the script, on a run ---
-
-
-@pytest.fixture(scope="module")
-def run_folder(tmp_path_factory):
-    """A run of one policy, to its end."""
-    folder = tmp_path_factory.mktemp("run")
-    config = toy_config(policies=("random",), num_rounds=1, train__num_steps=48)
-    workdir.claim(folder, config)
-    problem = build_problem(config, load_config_scene(config, cache_dir=None))
-    first = Run(config, problem, folder, None, 0)
-    first.finish()
-    Run(config, problem, folder, "random", 0).finish(first)
-    return folder
-
-
-def export(folder, *flags, cache):
-    command = [sys.executable, "-m", "experiments.export_field", f"--workdir={folder}", *flags]
-    env = os.environ | {"XDG_CACHE_HOME": str(cache), "JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
-    return subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=3000)
-
-
-def test_script_writes_files_that_agree_with_the_field(run_folder, tmp_path):
-    flags = ["--resolution=9", "--num_samples=300", "--density_threshold=0.5"]
-    done = export(run_folder, *flags, "--min_opacity=0.01", cache=tmp_path)
-    assert done.returncode == 0, done.stderr
-    folder = run_folder / "random" / "seed_0" / "export"
-    names = {"grid.npz", "density.nrrd", "sigma.nrrd", "uncertainty.nrrd", "points.ply"}
-    assert {path.name for path in folder.iterdir()} == names | {"mesh.ply", "geometry.json"}
-    assert all(str(folder / name) in done.stdout for name in names)
-    assert "round 1, 4 training views" in done.stdout
-
-    trained = load_trained(run_folder, cache=None)
-    assert trained.completed and trained.round == 1 and trained.policy == "random"
-    variance = fit_variance(trained, lambda *a: track(*a, stream=io.StringIO()))
-    point_fn = user_point_fn(trained, variance)
-    # The script compiles by itself; float32 sums in another order.
-    tolerance = {"rtol": 1e-3, "atol": 1e-5}
-    with np.load(folder / "grid.npz") as data:
-        assert data["density"].shape == (9, 9, 9) and data["names"].tolist() == ["density", "sigma"]
-        corner = [[data[a][2] for a in "xyz"]]
-        at_corner = point_fn(corner)
-        for name in ("density", "sigma"):
-            np.testing.assert_allclose(data[name][2, 2, 2], at_corner[name][0], **tolerance)
-        volume, _ = nrrd.read(str(folder / "sigma.nrrd"))
-        np.testing.assert_allclose(volume, data["sigma"], rtol=1e-6)
-
-    for name in ("points.ply", "mesh.ply"):
-        vertices, _ = read_vertices((folder / name).read_bytes())
-        assert len(vertices) > 3
-        positions = np.stack([vertices[a] for a in "xyz"], -1)
-        sigma = point_fn(positions)["sigma"]
-        np.testing.assert_allclose(vertices["sigma"], sigma, **tolerance)
-        expected = np.clip((np.log10(sigma) + 3.0) / 9.0, 0.0, 1.0)
-        np.testing.assert_allclose(vertices["uncertainty"], expected, atol=1e-3)
-    geometry = json.loads((folder / "geometry.json").read_text())
-    assert geometry["round"] == 1 and geometry["num_views"] == 4
-    assert geometry["whole"]["chamfer"] > geometry["floor"]["chamfer"] > 0.0
-
-
-def test_first_rounds_can_be_taken_up_too(run_folder):
-    trained = load_trained(run_folder, policy="initial", seed=0, cache=None)
-    assert trained.completed and trained.round == 0
-    assert int(trained.situation.is_training_view.sum()) == 2
-
-
-def test_folders_that_cannot_be_taken_up(run_folder, tmp_path):
-    with pytest.raises(WorkdirError, match=r"config\.json: does not exist: give the --workdir"):
-        load_trained(tmp_path, cache=None)
-    known = "--policy=initial --seed=0, --policy=random --seed=0"
-    for options in ({"policy": "bavs"}, {"seed": 7}):
-        with pytest.raises(WorkdirError, match=f"holds no checkpoint; runs that do: {known}"):
-            load_trained(run_folder, cache=None, **options)
-    assert not (run_folder / "bavs").exists()
-    (tmp_path / "config.json").write_text("{")
-    with pytest.raises(WorkdirError, match="is no JSON"):
-        load_trained(tmp_path, cache=None)
-
-
-def test_wrong_flags_end_in_one_line(tmp_path):
-    done = export(tmp_path, "--what=grid,voxels", cache=tmp_path)
-    assert done.returncode != 0 and "Traceback" not in done.stderr
-    assert "--what: ['grid', 'voxels'] cannot be used: give some of grid,points,mesh" in done.stderr

@@ -6,32 +6,21 @@ import numpy as np
 
 from bavs_jax.metrics.covered import Sweep
 from bavs_jax.uncertainty.cleanup import threshold_sigma
-from experiments.machine import device_name
-from experiments.posthoc.trained_run import TrainedRun
-
-SCHEMA_VERSION = 1
+from experiments.trained import TrainedRun
 
 
-def summary(run: TrainedRun, sweeps: dict[str, Sweep], row: int, options: dict, made: dict) -> dict:
-    """What `cleanup.json` holds; a measure that no pixel has is null, and so is `+inf`.
+def summary(run: TrainedRun, sweeps: dict[str, Sweep], row: int, options: dict) -> dict:
+    """What one run reports; a measure that no pixel has is null, and so is `+inf`.
 
     Args:
       run: the run that was cleaned.
       sweeps: "training" and "test".
       row: of the chosen threshold.
       options: of the choice and the measures.
-      made: command and seconds.
     """
     thresholds = sweeps["test"].thresholds
     laplace = run.toolbox.laplace
     return {
-        "schema_version": SCHEMA_VERSION,
-        "scene": run.problem.scene.name,
-        "policy": run.policy,
-        "seed": run.seed,
-        **made,
-        "device": device_name(),
-        "num_training_views": len(run.training_views),
         "options": {**options, "variant": laplace.variant, "extent": laplace.extent},
         "chosen": {
             "threshold": _number(thresholds[row]),
@@ -46,23 +35,25 @@ def summary(run: TrainedRun, sweeps: dict[str, Sweep], row: int, options: dict, 
     }
 
 
-def in_words(sweep: Sweep, row: int) -> str:
-    """What the clean-up is worth on test views, in one line."""
-    if row == len(sweep.thresholds) - 1:
+def in_words(row: dict) -> str:
+    """What the clean-up of a run is worth on test views, in one line."""
+    if row["chosen"]["threshold"] is None:
         return "nothing was removed: every threshold costs more of the training views than allowed"
-    after, before = _measures(sweep, row), _measures(sweep, -1)
-    parts = [
-        f"{name} {before[key]:.2f} -> {after[key]:.2f} dB"
-        for name, key in (("PSNR over covered pixels", "psnr_covered"), ("over all", "psnr"))
-        if before[key] is not None and after[key] is not None
-    ]
+    before, after = row["before"]["test"], row["after"]["test"]
+    parts = []
+    if after["psnr_covered"] is not None:
+        parts.append(
+            f"PSNR over still-covered pixels {after['psnr_covered_before']:.2f} -> "
+            f"{after['psnr_covered']:.2f} dB"
+        )
+    parts.append(f"over all {before['psnr']:.2f} -> {after['psnr']:.2f} dB")
     shares = (("covered", "share_covered"), ("empty pixels covered", "share_floating"))
     parts += [
         f"{name} {before[key]:.1%} -> {after[key]:.1%}"
         for name, key in shares
         if before[key] is not None
     ]
-    return f"threshold {sweep.thresholds[row]:.3f}: {', '.join(parts)}"
+    return f"threshold {row['chosen']['threshold']:.3f}: {', '.join(parts)}"
 
 
 def _measures(sweep: Sweep, row: int) -> dict[str, float | None]:

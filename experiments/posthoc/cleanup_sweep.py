@@ -12,8 +12,8 @@ from bavs_jax.metrics.covered import Sweep, pixel_sums, sweep_of
 from bavs_jax.rendering.images import render_views
 from bavs_jax.uncertainty.cleanup import make_cleaned_render_fn
 from experiments.build import RENDER_CHUNK
-from experiments.posthoc.trained_run import TrainedRun
 from experiments.progress import track
+from experiments.trained import TrainedRun
 
 
 def make_cleaned_chunk_fn(run: TrainedRun, variance) -> Callable:

@@ -19,8 +19,8 @@ from bavs_jax.uncertainty.draws import (
     noise_scale,
 )
 from experiments.build import RENDER_CHUNK, run_key
-from experiments.posthoc.trained_run import TrainedRun, run_curvature, run_precision
 from experiments.progress import track
+from experiments.trained import TrainedRun, run_curvature, run_precision
 
 
 class ViewDraws(NamedTuple):
@@ -68,7 +68,8 @@ def draw_views(
     """
     train, cameras = run.state.train, run.state.table.cameras
     total = int(np.diff(np.asarray(run.state.table.offsets))[view_ids].sum())
-    modes = run.problem.render(train, run_curvature(run), run.num_rays)
+    jac_sq_sum = run_curvature(run)
+    modes = run.problem.render(train, jac_sq_sum, run.num_rays)
     with track(total, f"{run.label}: {len(view_ids)} views", "rays") as bar:
         images = render_views(modes, cameras, view_ids, chunk=RENDER_CHUNK, progress_fn=bar.advance)
     if scale is None:
@@ -85,7 +86,10 @@ def draw_views(
     displaced = make_displaced_render_fn(
         field, sampler, tools.grid, background=tools.background, capacity=tools.capacity
     )
-    precision, key = run_precision(run), jax.random.fold_in(run_key(run.seed), 2**31 - 3)
+    precision, key = (
+        run_precision(run, jac_sq_sum),
+        jax.random.fold_in(run_key(run.seed), 2**31 - 3),
+    )
     by_draw = []
     with track(total * num_draws, f"{run.label}: {num_draws} draws", "rays") as bar:
         for draw in range(num_draws):

@@ -17,6 +17,7 @@ from experiments.files import write_atomic
 
 DPI = 150
 PANEL = 2.1  # inches
+TEXT = "#111827"
 
 
 class Panel(NamedTuple):
@@ -48,16 +49,26 @@ def panel_table(rows: Sequence[tuple[str, Sequence[Panel]]], *, scale_label: str
     for axes, (name, panels) in zip(grid, rows):
         for place, panel in zip(axes, panels):
             _show(place, panel)
-        axes[0].set_ylabel(name, fontsize=9, color="#111827")
+        axes[0].set_ylabel(name, fontsize=9, color=TEXT)
         mapped = [panel for panel in panels if panel.image.ndim == 2]
         if scale_label and mapped:
-            norm = Normalize(*mapped[-1].limits)
-            mappable = ScalarMappable(norm, mapped[-1].colours)
-            bar = figure.colorbar(mappable, ax=list(axes), shrink=0.8, pad=0.01)
-            bar.set_label(scale_label, fontsize=8)
-            bar.ax.tick_params(labelsize=7)
-            bar.outline.set_visible(False)
+            colour_bar(figure, axes, mapped[-1].colours, mapped[-1].limits, scale_label)
     return figure
+
+
+def colour_bar(figure: Figure, axes, colours: str, limits, label: str) -> None:
+    """The scale of a colour map at the right of a row of axes."""
+    mappable = ScalarMappable(Normalize(*limits), colours)
+    bar = figure.colorbar(mappable, ax=list(axes), shrink=0.8, pad=0.01)
+    bar.set_label(label, fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+    bar.outline.set_visible(False)
+
+
+def bare(axes: Axes) -> None:
+    """Takes the frame away."""
+    for spine in axes.spines.values():
+        spine.set_visible(False)
 
 
 def _show(axes: Axes, panel: Panel) -> None:
@@ -66,8 +77,7 @@ def _show(axes: Axes, panel: Panel) -> None:
     else:
         low, high = panel.limits
         axes.imshow(panel.image, cmap=panel.colours, vmin=low, vmax=high, interpolation="nearest")
-    axes.set_title(panel.title, fontsize=8.5, color="#111827")
+    axes.set_title(panel.title, fontsize=8.5, color=TEXT)
     axes.set_xticks([])
     axes.set_yticks([])
-    for spine in axes.spines.values():
-        spine.set_visible(False)
+    bare(axes)

@@ -24,7 +24,7 @@ from bavs_jax.uncertainty.streaming import training_pixels
 from experiments.build import RENDER_CHUNK, run_key
 from experiments.files import write_arrays, write_atomic
 from experiments.progress import track
-from experiments.trained import Trained
+from experiments.trained import TrainedRun
 
 # Of the box's longest side: the shell that the true surface is drawn from, and how far from that
 # surface a drawn point may be; both far below the mean distance between drawn points.
@@ -86,7 +86,7 @@ def write_grid(folder: pathlib.Path, scene: Scene, axes, grid: dict) -> dict[str
 
 def write_points(
     folder: pathlib.Path,
-    trained: Trained,
+    run: TrainedRun,
     point_fn: Callable,
     *,
     min_opacity: float,
@@ -94,14 +94,14 @@ def write_points(
     beyond_box: bool,
 ) -> dict[str, pathlib.Path]:
     """`points.ply`: where training rays end, with rendered colour and uncertainty there."""
-    scene, situation = trained.problem.scene, trained.situation
+    scene, situation = run.problem.scene, run.situation
     view_ids, within = training_pixels(situation.table, situation.is_training_view)
     if max_points and len(view_ids) > max_points:
-        rows = np.random.default_rng(trained.seed).permutation(len(view_ids))[:max_points]
+        rows = np.random.default_rng(run.seed).permutation(len(view_ids))[:max_points]
         view_ids, within = (x[np.sort(rows)] for x in (view_ids, within))
     with track(len(view_ids), "follow training rays", "rays") as bar:
         positions, rgb = ray_end_points(
-            trained.problem.render(situation.train),
+            run.problem.render(situation.train),
             situation.table,
             view_ids,
             within,
@@ -150,13 +150,13 @@ def write_mesh(
     return {"mesh": folder / "mesh.ply"}
 
 
-def measure_geometry(trained: Trained, mesh, signed_distance: Callable, *, num: int) -> dict:
+def measure_geometry(run: TrainedRun, mesh, signed_distance: Callable, *, num: int) -> dict:
     """Chamfer distances of the mesh from the scene's true surface, scene units."""
-    scene = trained.problem.scene
+    scene = run.problem.scene
     side = float(np.max(scene.box[1] - scene.box[0]))
     print(f"geometry: draws {num} points on each surface")
     true = sample_surface(
-        jax.random.fold_in(run_key(trained.seed), 2**31 - 4),
+        jax.random.fold_in(run_key(run.seed), 2**31 - 4),
         signed_distance,
         scene.box,
         2 * num,
@@ -165,7 +165,7 @@ def measure_geometry(trained: Trained, mesh, signed_distance: Callable, *, num: 
     )
     errors = geometry_error(
         scene,
-        sample_mesh(mesh, num, seed=trained.seed),
+        sample_mesh(mesh, num, seed=run.seed),
         true[:num],
         true[num:],
         distance=DISTANCE_SHARE * side,
