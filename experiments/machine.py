@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
+import pathlib
 import platform
 import resource
+import subprocess
 import sys
 
 import jax
@@ -13,10 +15,25 @@ import jax
 PACKAGES = ("bavs_jax", "jax", "jaxlib", "flax", "optax", "numpy")
 
 
-def package_versions() -> dict[str, str]:
-    """The versions that numbers may depend on."""
-    versions = {name: importlib.metadata.version(name) for name in PACKAGES}
-    return versions | {"python": platform.python_version()}
+def versions() -> dict[str, str]:
+    """Of the packages that results depend on, of Python, and of this code where it is known."""
+    found = {name: importlib.metadata.version(name) for name in PACKAGES}
+    found["python"] = platform.python_version()
+    commit = code_commit()
+    return found if commit is None else found | {"commit": commit}
+
+
+def code_commit() -> str | None:
+    """The git commit of this code, `-dirty` if files differ from it; None outside of a checkout."""
+    folder = pathlib.Path(__file__).parents[1]
+    if not (folder / ".git").exists():
+        return None
+    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=10"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
 
 
 def device_name() -> str:

@@ -21,7 +21,7 @@ from experiments.build import Problem, run_key
 from experiments.build_scene import initial_views
 from experiments.evaluate import evaluate_views, picture_arrays, spread_evenly
 from experiments.files import append_line, write_arrays, write_json
-from experiments.machine import device_name, package_versions, peak_memory_mb
+from experiments.machine import device_name, peak_memory_mb, versions
 from experiments.progress import track
 from experiments.report.choices import bound_words
 
@@ -231,7 +231,7 @@ class Run:
             "seed": self.seed,
             "command": self.command,
             "config": self.config.to_dict(),
-            "versions": package_versions(),
+            "versions": versions(),
             "device": device_name(),
             "peak_memory_mb": peak_memory_mb(),
             "completed": completed,

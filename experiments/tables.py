@@ -47,15 +47,19 @@ def markdown(table: Table) -> str:
 
 
 def result_tables(folder: pathlib.Path) -> str:
-    """The tables of a folder's `summary.json`, or else of what measures on trained runs left."""
+    """All tables of the experiment whose result file a folder holds.
+
+    Raises:
+      ReportError: it holds none, or one that cannot be used.
+    """
     found = [folder / name for name in TABLES if (folder / name).exists()]
     if found and not (folder / "summary.json").exists():
-        return "\n".join(map(posthoc_tables, found))
-    return run_tables(folder)
+        return "\n".join(map(_posthoc_tables, found))
+    return _run_tables(folder)
 
 
-def posthoc_tables(path: pathlib.Path) -> str:
-    """The table of one result file over its seeds."""
+def _posthoc_tables(path: pathlib.Path) -> str:
+    """What a script on a trained run has measured, over its seeds."""
     result = json.loads(path.read_text(encoding="utf-8"))
     num = len({row["seed"] for row in result["rows"]})
     over = "1 seed" if num == 1 else f"means over {num} seeds ± half of the 95 % interval"
@@ -63,7 +67,7 @@ def posthoc_tables(path: pathlib.Path) -> str:
     return f"{made}\n\n{markdown(TABLES[path.name](result['rows']))}\n"
 
 
-def run_tables(folder: pathlib.Path) -> str:
+def _run_tables(folder: pathlib.Path) -> str:
     """Quality at the last shared number of views, and where the time went."""
     runs = load_runs(folder)
     policies = list(dict.fromkeys(run.policy for run in runs))

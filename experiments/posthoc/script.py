@@ -17,7 +17,7 @@ from experiments import runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
 from experiments.errors import USER_ERRORS, ConfigError
-from experiments.machine import device_name, package_versions
+from experiments.machine import device_name, versions
 from experiments.trained import (
     FIRST_ROUND,
     TrainedRun,
@@ -116,7 +116,7 @@ def result_file(run: TrainedRun, rows: list[dict]) -> dict:
         "kind": run.config.loader,
         "command": runtime.command_line(),
         "config": run.config.to_dict(),
-        "versions": package_versions(),
+        "versions": versions(),
         "device": device_name(),
         "rows": rows,
     }
