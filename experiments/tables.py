@@ -4,9 +4,8 @@
     python -m experiments.tables --page=README.md
 
 The first prints the tables of one experiment. The second writes every table of a page anew: each
-stands between `<!-- results: FOLDER -->` and `<!-- end of results -->`, where FOLDER holds a
-`summary.json`, or the `uncertainty.json` of `experiments.evaluate_uncertainty`, and is relative to
-the page.
+stands between `<!-- results: FOLDER -->` and `<!-- end of results -->`, where FOLDER holds a result
+file of one of the scripts (`result_parts.py`) and is relative to the page.
 """
 
 from __future__ import annotations
@@ -20,17 +19,8 @@ from absl import flags
 from experiments import runtime
 from experiments.files import write_atomic
 from experiments.report import ReportError
-from experiments.report.results import load_runs
-from experiments.report.tables import (
-    Table,
-    baseline_table,
-    final_table,
-    rounds_table,
-    timing_table,
-)
-from experiments.uncertain.results import NAME as UNCERTAINTY_FILE
-from experiments.uncertain.results import known_quantities, load_result, split_words
-from experiments.uncertain.tables import coverage_table, summary_table
+from experiments.report.tables import Table
+from experiments.result_parts import result_parts
 
 FLAGS = flags.FLAGS
 flags.DEFINE_string("workdir", None, "Folder of an experiment: print its tables.")
@@ -49,38 +39,9 @@ def markdown(table: Table) -> str:
 
 
 def result_tables(folder: pathlib.Path) -> str:
-    """All tables of the experiment whose result file a folder holds.
-
-    Raises:
-      ReportError: it holds none, or one that cannot be used.
-    """
-    if (folder / UNCERTAINTY_FILE).exists() and not (folder / "summary.json").exists():
-        return _uncertainty_tables(folder)
-    return _run_tables(folder)
-
-
-def _run_tables(folder: pathlib.Path) -> str:
-    """Quality at the last shared number of views, and where the time went."""
-    runs = load_runs(folder)
-    policies = list(dict.fromkeys(run.policy for run in runs))
-    command = runs[0].result["command"]
-    made = f"`{command}` ({runs[0].result['device']}; means over seeds ± half of the 95 % interval)"
-    tables = [final_table, rounds_table, baseline_table, timing_table]
-    made_tables = [table for make in tables if (table := make(runs, policies)) is not None]
-    return "\n\n".join([made, *map(markdown, made_tables)]) + "\n"
-
-
-def _uncertainty_tables(folder: pathlib.Path) -> str:
-    """How well uncertainty tells error, and how well calibrated intervals hold."""
-    result = load_result(folder)
-    rows = result["rows"]
-    parts = [
-        f"`{result['command']}` ({result['device']}; means over seeds ± half of the 95 % interval)",
-        markdown(summary_table(rows)),
-        f"Intervals: {split_words(result)}. Coverage ± its standard error over the test views.",
-        *(markdown(coverage_table(rows, quantity)) for quantity in known_quantities(rows)),
-    ]
-    return "\n\n".join(parts) + "\n"
+    """Words and tables about the experiment in a folder, as Markdown; see `result_parts`."""
+    parts = result_parts(folder)
+    return "\n\n".join(part if isinstance(part, str) else markdown(part) for part in parts) + "\n"
 
 
 def fill_page(text: str, root: pathlib.Path) -> str:

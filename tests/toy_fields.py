@@ -5,6 +5,7 @@ import jax.numpy as jnp
 
 from bavs_jax.cameras import Rays
 from bavs_jax.fields.base import Field
+from bavs_jax.rendering.samplers import Sampler, dense_samples
 
 
 def smooth_field_fn(positions, directions):
@@ -39,3 +40,23 @@ def rays_through(key, num, box_half_side=1.0):
     inside = jax.random.uniform(inside_key, (num, 3), minval=-0.6, maxval=0.6) * box_half_side
     directions = inside - outside
     return Rays(outside, directions / jnp.linalg.norm(directions, axis=-1, keepdims=True))
+
+
+def even_sampler(*, near, far, num) -> Sampler:
+    """The same even steps along every ray."""
+
+    def sample(key, params, state, rays):
+        num_rays = rays.origins.shape[0]
+        edges = jnp.tile(jnp.linspace(near, far, num + 1), (num_rays, 1))
+        mids = 0.5 * (edges[:, 1:] + edges[:, :-1])
+        return dense_samples(mids, jnp.diff(edges), jnp.zeros(num_rays, bool)), {}
+
+    return Sampler(
+        init=lambda key: {},
+        init_state=lambda: {},
+        sample=sample,
+        update=lambda key, state, density_fn, step: state,
+        loss=lambda aux, samples, weights, colour_loss_fn: 0.0,
+        num_slots=num,
+        dense=True,
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -22,6 +23,7 @@ def render_pixels(
     *,
     background,
     capacity: int,
+    displace_fn: Callable | None = None,
     channels: dict | None = None,
 ) -> tuple[Rendering, Samples]:
     """Renders rays with a trained field; arguments as in `render_rays`.
@@ -41,6 +43,7 @@ def render_pixels(
         capacity=capacity,
         exact=True,
         inputs=field.inputs(rays, samples),
+        displace_fn=displace_fn,
         channels=channels,
     )
     return rendering, samples

@@ -14,12 +14,11 @@ import jax
 import numpy as np
 
 from bavs_jax.rendering.images import render_views
-from bavs_jax.uncertainty.model import Situation
 from experiments.build import RENDER_CHUNK, Problem, run_key
 from experiments.evaluate import mean_quality, spread_evenly
 from experiments.files import write_arrays, write_json
 from experiments.machine import code_commit
-from experiments.runner import Run
+from experiments.trained import FIRST_ROUND, train_run
 from experiments.uncertain import intervals, measure
 from experiments.uncertain.band_picture import band_arrays
 from experiments.uncertain.calibration_file import calibration_path, save_calibration
@@ -31,16 +30,9 @@ COMMON_MODEL = "entropy"  # fits nothing: what it renders is the run's own field
 
 def trained_situation(config, problem: Problem, folder: pathlib.Path, seed: int, command: str):
     """The field of a seed at the end of its run of the config's first policy."""
-    first = Run(config, problem, folder, None, seed, command)
-    first.finish()
-    policy = config.policies[0] if config.num_rounds else None
-    if policy is not None:
-        Run(config, problem, folder, policy, seed, command).finish(first)
-    state = Run(config, problem, folder, policy, seed, command).state()
-    num_rays = int(np.diff(problem.scene.offsets)[first.initial].sum())
-    return Situation(
-        *(state.train, state.table, state.is_training_view, num_rays), label=f"seed {seed}"
-    )
+    policy = config.policies[0] if config.num_rounds else FIRST_ROUND
+    run = train_run(config, problem, folder, policy, seed, command)
+    return run.situation._replace(label=f"seed {seed}")
 
 
 def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, command: str) -> None:

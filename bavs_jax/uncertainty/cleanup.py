@@ -1,0 +1,199 @@
+"""Clean-up of floaters: density is removed wherever the uncertainty is above a threshold.
+
+As in Bayes' Rays (Goli et al. 2024, section 5.2): the trained field stays as it is, and what it
+says of a point counts only if the deformation posterior is certain enough there.
+
+Thresholds are always on the [0, 1] form of the uncertainty, `(log10 sigma + 3) / 9` clipped (see
+`channel.py`), whatever scale is rendered and scored elsewhere. `+inf` removes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bavs_jax.fields.base import Field
+from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.metrics.covered import Sweep
+from bavs_jax.rendering.compositing import composite_colour, expected_depth, render_weights
+from bavs_jax.rendering.pixels import render_pixels
+from bavs_jax.rendering.samplers import Sampler
+from bavs_jax.uncertainty.channel import finish_uncertainty, make_uncertainty_channel
+
+RULES = ("keep", "knee")
+
+
+def make_point_uncertainty_fn(
+    grid: DeformationGrid, variance: jax.Array, *, variant: str, extent: str = "box"
+) -> Callable:
+    """Makes the uncertainty of points that thresholds are held against.
+
+    Args:
+      grid: the deformation grid.
+      variance: [G] from `vertex_variance`.
+      variant, extent: see `make_uncertainty_channel`; with the extent `box`, what lies outside of
+        the scene box is never removed.
+
+    Returns:
+      `uncertainty(positions [..., 3]) -> [...]` in [0, 1].
+    """
+    channel = make_uncertainty_channel(grid, variance, variant=variant, scale="log", extent=extent)
+
+    def uncertainty(positions):
+        return finish_uncertainty(channel.value_fn(positions, None), scale="log")
+
+    return uncertainty
+
+
+def clean_field(field: Field, uncertainty_fn: Callable, threshold) -> Field:
+    """The field without the density of uncertain points: `sigma(x) [u(x) <= threshold]`.
+
+    It goes wherever a field goes: into the renderer, into curvature, into an export.
+
+    Args:
+      field: the trained field.
+      uncertainty_fn: positions [K, 3] -> [K], from `make_point_uncertainty_fn`.
+      threshold: [] in the unit of the uncertainty; may be traced.
+    """
+
+    def kept(positions, density):
+        return jnp.where(uncertainty_fn(positions) > threshold, 0.0, density)
+
+    def apply(params, positions, directions, **inputs):
+        density, *rest = field.apply(params, positions, directions, **inputs)
+        return kept(positions, density), *rest
+
+    def density(params, positions, **inputs):
+        return kept(positions, field.density(params, positions, **inputs))
+
+    return field._replace(apply=apply, density=density)
+
+
+def make_cleaned_render_fn(
+    field: Field,
+    sampler: Sampler,
+    grid: DeformationGrid,
+    *,
+    background,
+    capacity: int,
+    variant: str,
+    extent: str = "box",
+) -> Callable:
+    """Makes the compiled rendering of `clean_field` for many thresholds at once.
+
+    To remove a point changes nothing of what the field says elsewhere, so that one evaluation of
+    all samples serves every threshold; only the compositing (Eqs 2-3) is done for each. Thresholds
+    are traced: a sweep compiles once for each number of them.
+
+    Samples lie where the sampler of the *untouched* field puts them. Steps through an occupancy
+    grid are even, so nothing is lost; samplers that gather samples at the first surface leave few
+    for what lies behind a removed floater.
+
+    Args:
+      field, sampler, grid: as trained, and the deformation grid.
+      background, capacity: see `render_rays`.
+      variant, extent: see `make_point_uncertainty_fn`.
+
+    Returns:
+      `render(params, sampler_state, variance [G], thresholds [T], rays [R])`, a dict of "rgb"
+      [R, T, 3], "depth" [R, T] (scene units), "opacity" [R, T], and "content" [R, T]: the rendering
+      weight of the untouched field that its samples up to the threshold hold,
+      `sum_i w_i [u_i <= threshold]`.
+    """
+
+    @jax.jit
+    def render(params, sampler_state, variance, thresholds, rays):
+        uncertainty_fn = make_point_uncertainty_fn(grid, variance, variant=variant, extent=extent)
+
+        def apply_and_keep(field_params, positions, directions, **inputs):
+            density, rgb, *_ = field.apply(field_params, positions, directions, **inputs)
+            return density, rgb, {"rgb": rgb, "uncertainty": uncertainty_fn(positions)}
+
+        untouched, samples = render_pixels(
+            field._replace(apply=apply_and_keep),
+            sampler,
+            params,
+            sampler_state,
+            rays,
+            background=background,
+            capacity=capacity,
+        )
+        rgb, uncertainty = untouched.values["rgb"], untouched.values["uncertainty"]
+
+        def composited(threshold):
+            removed = uncertainty > threshold
+            weights = render_weights(jnp.where(removed, 0.0, untouched.density), samples.deltas)
+            return {
+                "rgb": composite_colour(weights, rgb, background),
+                "depth": expected_depth(weights, samples.t_mids),
+                "opacity": weights.sum(-1),
+                "content": jnp.where(removed, 0.0, untouched.weights).sum(-1),
+            }
+
+        # One threshold after another: all at once would hold [T, R, S] several times over.
+        by_threshold = jax.lax.map(composited, thresholds)
+        return {name: jnp.moveaxis(value, 0, 1) for name, value in by_threshold.items()}
+
+    return render
+
+
+def spread_thresholds(variance, num: int) -> np.ndarray:
+    """Thresholds from the most certain vertex to the least certain one, and `+inf` at the end.
+
+    Args:
+      variance: [G] from `vertex_variance`, scene unit^2, > 0.
+      num: how many below `+inf`, evenly spaced in the [0, 1] form.
+
+    Returns:
+      [num + 1] ascending.
+    """
+    ends = jnp.array([jnp.min(variance), jnp.max(variance)])
+    low, high = finish_uncertainty(0.5 * jnp.log10(ends), scale="log")
+    return np.append(np.linspace(low, high, num), np.inf).astype(np.float32)
+
+
+def choose_threshold(sweep: Sweep, *, rule: str = "keep", keep: float = 0.99) -> int:
+    """Which threshold to clean up with, from renders of the *training* views alone.
+
+    What the photos show must stay, and what no photo relies on may go. "What the photos show" is
+    the content of the training rays: each sample of the untouched field counts by its rendering
+    weight (`Sweep.content_kept`). A field shows no view that was left out, so no test view enters.
+
+    `keep`: the lowest threshold that keeps at least the share `keep` of the training content; on a
+    fine sweep this is the `keep` quantile of the uncertainty of what the photos show.
+    `knee`: where the curve of kept content over finite thresholds lies highest above the straight
+    line between its ends (Satopaa et al. 2011): from there on a lower threshold costs more content
+    for each step than it did on the average.
+
+    Args:
+      sweep: of the training views.
+      rule: one of `RULES`.
+      keep: share of the content, in (0, 1]; read by the rule `keep` alone.
+
+    Returns:
+      Row of `sweep`, the last (`+inf`, no clean-up) if no other keeps enough.
+
+    Raises:
+      ValueError: unknown rule, a share outside of (0, 1], or fewer than 3 finite thresholds for
+        the rule `knee`.
+    """
+    if rule not in RULES:
+        raise ValueError(f"rule: {rule!r} is unknown; use one of {', '.join(RULES)}")
+    kept = np.asarray(sweep.content_kept)
+    if rule == "keep":
+        if not 0.0 < keep <= 1.0:
+            raise ValueError(f"keep: {keep} is no share; give a number above 0 and up to 1")
+        return int(np.argmax(kept >= keep)) if kept[-1] >= keep else len(kept) - 1
+    finite, kept = np.asarray(sweep.thresholds)[:-1], kept[:-1]
+    if len(finite) < 3:
+        raise ValueError(f"thresholds: {len(finite)} are too few for a knee; give 3 or more")
+    chord = np.interp(finite, finite[[0, -1]], kept[[0, -1]])
+    return int(np.argmax(kept - chord))
+
+
+def threshold_sigma(threshold) -> np.ndarray:
+    """The offset's standard deviation that a threshold stands for, `10^(9 u - 3)`, scene units."""
+    return 10.0 ** (9.0 * np.asarray(threshold, np.float64) - 3.0)

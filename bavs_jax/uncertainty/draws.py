@@ -1,0 +1,95 @@
+"""Scenes that the photos allow: offsets drawn from the posterior, and rendered (Fig 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from bavs_jax.fields.base import Field
+from bavs_jax.fields.deformation import DeformationGrid, displace
+from bavs_jax.rendering.pixels import basic_images, render_pixels
+from bavs_jax.rendering.samplers import Sampler
+
+
+def draw_offsets(key, precision: jax.Array, num: int, *, scale=1.0, limit=jnp.inf) -> jax.Array:
+    """Offsets from the Laplace posterior, `theta = scale * n / sqrt(H)`, `n ~ N(0, 1)` (Eqs 6-9).
+
+    Args:
+      key: random key.
+      precision: H [G, 3] > 0, 1 / scene unit^2, from `posterior_precision`.
+      num: how many draws; each is as large as `precision`, so that large grids take one at a time.
+      scale: temperature, in standard deviations. At 1 the energy is the mean loss itself, as in
+        Eq 6, however many rays it is over; `noise_scale` makes it a posterior of the pixels.
+      limit: largest offset along each axis, [] or [3], scene units.
+
+    Returns:
+      [num, G, 3] scene units.
+
+    Numerics: clipped to `limit`. A vertex that no ray has seen has the prior's variance, which is
+    far larger than the scene: its matter would be thrown out of the box, not moved.
+    """
+    noise = jax.random.normal(key, (num, *precision.shape), precision.dtype)
+    return jnp.clip(scale * noise / jnp.sqrt(precision), -limit, limit)
+
+
+def noise_scale(mse, num_rays) -> jax.Array:
+    """The temperature at which draws are as wide as noisy pixels allow: `sqrt(2 s^2 / R)`.
+
+    For R pixels whose channels have noise of variance `s^2`, the negative log likelihood is
+    `(R / 2 s^2)` times the mean over rays of the squared colour error (summed over channels), whose
+    curvature H is: the posterior's variance is then `(2 s^2 / R) / H`.
+
+    Args:
+      mse: s^2, the mean over training pixels and channels of the squared colour error.
+      num_rays: R of `posterior_precision`.
+    """
+    return jnp.sqrt(2.0 * mse / num_rays)
+
+
+def make_displaced_render_fn(
+    field: Field, sampler: Sampler, grid: DeformationGrid, *, background, capacity: int
+) -> Callable:
+    """Makes the compiled rendering of the field read at `x + D_theta(x)`.
+
+    Samples lie where they lie for `theta = 0`, as they do for the curvature: what moves is where
+    the field is read.
+
+    Args:
+      field, sampler, grid: as trained, and the deformation grid.
+      background, capacity: see `render_rays`.
+
+    Returns:
+      `render(params, sampler_state, offsets [G, 3], rays [R]) -> {"rgb" [R, 3], "depth" [R],
+      "opacity" [R], "thinned" [R]}`. Offsets are traced: no draw compiles anew.
+    """
+
+    @jax.jit
+    def render(params, sampler_state, offsets, rays):
+        rendering, samples = render_pixels(
+            field,
+            sampler,
+            params,
+            sampler_state,
+            rays,
+            background=background,
+            capacity=capacity,
+            displace_fn=partial(displace, grid, offsets),
+        )
+        return basic_images(rendering, samples)
+
+    return render
+
+
+def colour_spread(rgb: jax.Array) -> jax.Array:
+    """How far a pixel's colour moves over draws: `sqrt(mean_c var_d C_dc)`, in [0, 1].
+
+    Args:
+      rgb: [D, ..., 3] of D >= 2 draws, sRGB in [0, 1].
+
+    Returns:
+      [...]; the variance is the unbiased one.
+    """
+    return jnp.sqrt(jnp.var(rgb, axis=0, ddof=1).mean(-1))

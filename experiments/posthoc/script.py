@@ -1,0 +1,141 @@
+"""What the scripts on a trained run share: their flags, and the runs that these name.
+
+With --config a run is trained as far as --workdir does not hold it yet; without, the last
+checkpoints in --workdir are taken up as they are.
+"""
+
+from __future__ import annotations
+
+import pathlib
+import sys
+from collections.abc import Callable, Iterator
+
+from absl import flags
+from ml_collections import config_flags
+
+from experiments import runtime, workdir
+from experiments.build import build_problem
+from experiments.build_scene import load_config_scene
+from experiments.errors import USER_ERRORS, ConfigError
+from experiments.machine import device_name, versions
+from experiments.trained import (
+    FIRST_ROUND,
+    TrainedRun,
+    choose_runs,
+    field_kind,
+    load_run,
+    saved_config,
+    train_run,
+)
+
+SCHEMA_VERSION = 1
+
+FLAGS = flags.FLAGS
+config_flags.DEFINE_config_file(
+    "config",
+    None,
+    "What to train first where --workdir does not hold it yet, such as "
+    "experiments/configs/quickstart.py; every option can be set as --config.name=value. Without "
+    "it, the runs that --workdir holds are taken up where they are.",
+    lock_config=True,
+)
+flags.DEFINE_string(
+    "workdir", None, "Folder of a run of experiments.active_selection, or of a new one."
+)
+flags.DEFINE_string(
+    "policy", "", "Whose field; initial: round 0. By default the config's first policy."
+)
+flags.DEFINE_integer("seed", None, "Of which seed; by default all seeds of that policy.")
+flags.DEFINE_string("data_dir", "", "Folder of scenes, if it has moved since the run.")
+flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
+
+
+def check_flags(*rules: tuple[str, bool, str]) -> None:
+    """Raises ConfigError for the first flag whose rule `(name, is good, fix)` does not hold."""
+    for name, good, fix in rules:
+        if not good:
+            raise ConfigError(f"--{name}: {FLAGS[name].value!r} cannot be used: {fix}")
+
+
+def trained_runs() -> Iterator[TrainedRun]:
+    """The runs that the flags name, one after another; one scene and one compilation for all.
+
+    Raises:
+      ConfigError, WorkdirError, SceneError: flags, folder or scene cannot be used.
+    """
+    folder, config = pathlib.Path(FLAGS.workdir), FLAGS.config
+    if config is None:
+        saved = saved_config(folder)
+        chosen = choose_runs(folder, saved, FLAGS.policy, FLAGS.seed)
+        config, take_up = saved, load_run
+        config.data_dir = FLAGS.data_dir or config.data_dir
+    else:
+        if FLAGS.data_dir:
+            raise ConfigError("--data_dir: with --config, give --config.data_dir in its place")
+        # A config without rounds ends where all policies begin.
+        policy = FLAGS.policy or (config.policies[0] if config.num_rounds else FIRST_ROUND)
+        field_kind(policy)  # an unknown policy ends here, before anything is written
+        folder.mkdir(parents=True, exist_ok=True)
+        workdir.claim(folder, config)
+        seeds = config.seeds if FLAGS.seed is None else (FLAGS.seed,)
+        chosen, take_up = [(policy, seed) for seed in seeds], _train_run
+    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    problem = build_problem(config, scene, field_kind(chosen[0][0]))
+    for policy, seed in chosen:
+        run = take_up(config, problem, folder, policy, seed)
+        state = "the end of" if run.completed else "the last checkpoint of"
+        print(f"{scene.name}: {state} {run.label}, {len(run.training_views)} training views")
+        yield run
+
+
+def _train_run(*args) -> TrainedRun:
+    return train_run(*args, command=runtime.command_line())
+
+
+def about_run(run: TrainedRun) -> dict:
+    """What a result file says first: of which run it is."""
+    return {
+        "policy": run.policy,
+        "seed": run.seed,
+        "completed": run.completed,
+        "round": int(run.state.round),
+        "num_views": len(run.training_views),
+    }
+
+
+def result_file(run: TrainedRun, rows: list[dict]) -> dict:
+    """A result file over the runs of a folder, each a row, with all that made it.
+
+    Args:
+      run: any of them.
+      rows: each begins with `about_run`.
+    """
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "scene": run.problem.scene.name,
+        "kind": run.config.loader,
+        "command": runtime.command_line(),
+        "config": run.config.to_dict(),
+        "versions": versions(),
+        "device": device_name(),
+        "rows": rows,
+    }
+
+
+def run_on_trained(work: Callable[[], None]) -> None:
+    """Starts `work()` as the main of a script; what is wrong with its flags ends in one line."""
+
+    def main() -> None:
+        if not FLAGS.workdir:
+            sys.exit("error: --workdir: is missing; name the folder of a run")
+        if FLAGS.compilation_cache:
+            runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
+        try:
+            work()
+        except OSError as error:
+            # The config file is only read when it is first used.
+            sys.exit(f"error: {' '.join(str(error).split())}")
+        except USER_ERRORS as error:
+            sys.exit(f"error: {error}")
+
+    runtime.run_script(main)
