@@ -99,11 +99,14 @@ def scanline_plot(arrays: dict[str, np.ndarray], model: str) -> str:
     if np.isfinite(ends).all() and ends[0] < ends[1]:
         margin = 0.06 * (ends[1] - ends[0])
         axes.set_ylim(ends[0] - margin, ends[1] + margin)
+    if known[row].any():
+        places = np.flatnonzero(known[row])
+        axes.set_xlim(places[0] - 2.5, places[-1] + 2.5)
     unit = "scene units" if quantity == "depth" else "farthest channel, 0 to 1"
     axes.set_xlabel(f"pixel of image row {row}", fontsize=10, color="#374151")
     axes.set_ylabel(f"{quantity} ({unit})", fontsize=10, color="#374151")
     axes.set_title(
-        f"{model}: one row of {arrays['band_name']}, {quantity} ± half-width at {LEVEL:.0%}",
+        f"{model}: one row of {arrays['band_name']}",
         fontsize=10.5,
         loc="left",
     )

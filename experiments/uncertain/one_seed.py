@@ -42,6 +42,7 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
     ]
     if not missing:
         return
+    commit = code_commit()  # now: files may be edited while it runs
     scene, options = problem.scene, config.evaluation
     situation = trained_situation(config, problem, folder, seed, command)
     view_ids = spread_evenly(scene.test, options.num_views)
@@ -72,7 +73,7 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
             **numbers,
             **more_numbers,
             "seconds": {"fit": fitted.seconds, "render": rendered.seconds, "intervals": seconds},
-            "commit": code_commit(),
+            "commit": commit,
         }
         write_json(path, row)
 
