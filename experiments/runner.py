@@ -136,6 +136,7 @@ class Run:
                 int(info.survivors_farthest_overlap) if info.filter else None
             ),
             "batch_bound": info.bound._asdict() if info.bound else None,
+            "predicted": choice.predicted,
         }
         self._log(event="choice", round=number, **self.pending)
         if info.bound:
@@ -257,7 +258,7 @@ class Run:
 
 
 def _new_pending() -> dict:
-    names = ("train", "curvature", "fit", "score", "select", "evaluate")
+    names = ("train", "curvature", "fit", "score", "select", "predict", "evaluate")
     return {"selected": [], "seconds": dict.fromkeys(names, 0.0)}
 
 

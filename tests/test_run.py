@@ -64,6 +64,7 @@ def test_results_have_the_agreed_form(finished):
                 "fit",
                 "score",
                 "select",
+                "predict",
                 "evaluate",
             }
         assert [r["num_test_views"] for r in run["rounds"]] == [2, 2, 3]

@@ -139,7 +139,10 @@ def _nearest_squared(positions, others) -> np.ndarray:
 
 
 def _decibels(before: float, after: float) -> float:
-    """`10 log10(before / after)`; 0 where there was no error to begin with."""
+    """`10 log10(before / after)`; 0 where there was no error to begin with.
+
+    Numerics: below 0 is clipped to 0: sums of shrinking terms rise by their rounding at most.
+    """
     if before == 0.0:
         return 0.0
-    return 10.0 * math.log10(before / after) if after > 0.0 else math.inf
+    return max(10.0 * math.log10(before / after), 0.0) if after > 0.0 else math.inf
