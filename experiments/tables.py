@@ -5,11 +5,12 @@
 
 The first prints the tables of one experiment. The second writes every table of a page anew: each
 stands between `<!-- results: FOLDER -->` and `<!-- end of results -->`, where FOLDER holds a
-`summary.json` and is relative to the page.
+`summary.json`, or a `predicted_gain.json`, and is relative to the page.
 """
 
 from __future__ import annotations
 
+import json
 import pathlib
 import re
 import sys
@@ -18,6 +19,7 @@ from absl import flags
 
 from experiments import runtime
 from experiments.files import write_atomic
+from experiments.predicted.results import RESULT_FILE, correlation_table, stop_table
 from experiments.report import ReportError
 from experiments.report.results import load_runs
 from experiments.report.tables import (
@@ -44,8 +46,17 @@ def markdown(table: Table) -> str:
     return "\n".join([*lines, *reasons])
 
 
+def gain_tables(result: dict) -> str:
+    """How well predicted gains tell realised ones, and the stop rule tried on left-out seeds."""
+    made = "; ".join(f"`{command}`" for command in result["commands"])
+    tables = (correlation_table(result), stop_table(result, "seed"))
+    return "\n\n".join([f"{made}: {len(result['cases'])} batches", *map(markdown, tables)]) + "\n"
+
+
 def result_tables(folder: pathlib.Path) -> str:
-    """Quality at the last shared number of views, and where the time went."""
+    """Quality at the last shared number of views, and where the time went; or predicted gains."""
+    if (folder / RESULT_FILE).exists():
+        return gain_tables(json.loads((folder / RESULT_FILE).read_text(encoding="utf-8")))
     runs = load_runs(folder)
     policies = list(dict.fromkeys(run.policy for run in runs))
     command = runs[0].result["command"]

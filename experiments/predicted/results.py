@@ -12,6 +12,7 @@ from experiments.predicted.cases import PREDICTORS, Case, known
 from experiments.report.headline import signed
 from experiments.report.tables import Cell, Table, dash
 
+RESULT_FILE = "predicted_gain.json"
 THRESHOLDS = (0.25, 0.5, 1.0)  # dB
 GROUPS: dict[str, Callable[[Case], object]] = {
     "pooled": lambda case: "all",
@@ -86,12 +87,8 @@ def correlation_table(result: dict) -> Table:
         cells += [_error_cell(found["calibration"][held], held, "rmse") for held in HELD_OUT]
         rows.append(tuple(cells))
     first = next(iter(result["predictors"].values()))
-    constant = [
-        _error_cell(first["calibration"][held], held, "constant_rmse") for held in HELD_OUT
-    ]
-    rows.append(
-        (Cell("a constant"), *[dash("a constant ranks nothing")] * len(GROUPS), *constant)
-    )
+    constant = [_error_cell(first["calibration"][held], held, "constant_rmse") for held in HELD_OUT]
+    rows.append((Cell("a constant"), *[dash("a constant ranks nothing")] * len(GROUPS), *constant))
     return Table(head, tuple(rows))
 
 
