@@ -24,6 +24,7 @@ from experiments.build_scene import initial_views
 from experiments.evaluate import evaluate_views, picture_arrays, spread_evenly
 from experiments.files import append_line, write_arrays, write_json
 from experiments.machine import device_name, peak_memory_mb
+from experiments.predicted.cases import realised_gain
 from experiments.progress import track
 from experiments.report.choices import bound_words
 
@@ -161,6 +162,8 @@ class Run:
             pending["selected"] = self.initial.tolist()
         pending["seconds"]["evaluate"] = time.monotonic() - start
         row = {"num_views": int(state.is_training_view.sum()), **pending, **measures}
+        if self.rounds:
+            row["realised_db"] = realised_gain(self.rounds[-1], row)
         self.rounds.append(row)
         self.pending = _new_pending()
         self._save(state)

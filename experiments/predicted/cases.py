@@ -43,6 +43,16 @@ class Case:
         return self.scene, self.round, self.seed
 
 
+def realised_gain(before: dict, after: dict) -> float | None:
+    """Rise of the mean PSNR from one round's row to the next, dB.
+
+    None where the rounds were measured on different numbers of test views.
+    """
+    if before["num_test_views"] != after["num_test_views"]:
+        return None
+    return after["psnr"] - before["psnr"]
+
+
 def run_cases(run: Run) -> tuple[list[Case], int]:
     """The cases of a run, and how many rounds were left out.
 
@@ -51,8 +61,8 @@ def run_cases(run: Run) -> tuple[list[Case], int]:
     """
     cases, left_out = [], 0
     for number, (before, after) in enumerate(itertools.pairwise(run.rounds), start=1):
-        same_views = before["num_test_views"] == after["num_test_views"]
-        if not after.get("predicted") or not same_views:
+        realised = realised_gain(before, after)
+        if not after.get("predicted") or realised is None:
             left_out += 1
             continue
         cases.append(
@@ -63,7 +73,7 @@ def run_cases(run: Run) -> tuple[list[Case], int]:
                 round=number,
                 num_views=before["num_views"],
                 predicted={name: after["predicted"].get(name) for name in PREDICTORS},
-                realised=after["psnr"] - before["psnr"],
+                realised=realised,
             )
         )
     return cases, left_out

@@ -111,12 +111,12 @@ def stop_table(result: dict, held: str) -> Table:
       result: the result file.
       held: a key of `HELD_OUT`.
     """
-    head = ("stop below", "predictor", "cases", "hit rate", "base rate", "stops")
+    head = ("predictor", "stop below", "cases", "hit rate", "base rate", "stops")
     head += ("false stops", "missed stops")
     rows = []
     for place, threshold in enumerate(THRESHOLDS):
         for name, found in result["predictors"].items():
-            cells = [Cell(f"{threshold:g} dB"), Cell(PREDICTORS[name][0])]
+            cells = [Cell(PREDICTORS[name][0]), Cell(f"{threshold:g} dB")]
             if found["calibration"][held] is None:
                 rows.append((*cells, *[dash(f"one {held} only")] * (len(head) - 2)))
                 continue
