@@ -61,7 +61,7 @@ class Stages(NamedTuple):
     `restart(key, train_state) -> train_state` at the start of each round after the first: a fresh
       optimiser, and fresh parameters too where each round trains from scratch.
     `sources(policy, key, situation, candidates) -> Sources` (see `sources.py`)
-    `predict(situation, candidates, selected [k]) -> dict` (see `prediction.py`), or None.
+    `predict(situation, candidates, batches) -> list of dicts` (see `prediction.py`), or None.
     """
 
     train_call: Callable
@@ -143,7 +143,7 @@ def make_active_step(
         seconds = {**sources.seconds, "select": elapsed - sum(sources.seconds.values())}
         predicted, start = None, time.perf_counter()
         if stages.predict is not None:
-            predicted = stages.predict(situation, candidates, selected)
+            (predicted,) = stages.predict(situation, candidates, [selected])
         seconds["predict"] = time.perf_counter() - start
         table, view_ids = source.acquire(state.table, state.is_training_view, candidates, selected)
         state = state.replace(

@@ -35,7 +35,11 @@ NUM_REFERENCE = 16
 def make_predict_fn(
     toolbox: Toolbox, *, image_scale: float, num_reference: int = NUM_REFERENCE
 ) -> Callable:
-    """Makes `predict(situation, candidates, selected [k]) -> dict`, one number by each definition.
+    """Makes `predict(situation, candidates, batches) -> list of dicts`, one for each batch.
+
+    `batches` are candidates' indices [k] each, taken one after another: what is predicted of the
+    second is what it adds to the first. The field stays that of the situation. By each definition
+    one number:
 
     - `variance_db`: the predicted gain, dB, with a prior of one grid cell (`variance_gain_db`).
     - `paper_prior_db`: the same with the paper's prior, `2 lambda`.
@@ -52,28 +56,36 @@ def make_predict_fn(
       num_reference: views whose rays are the reference.
     """
 
-    def predict(situation: Situation, candidates: Candidates, selected) -> dict:
-        table, is_training = situation.table, np.asarray(situation.is_training_view)
-        training = take(table.cameras, np.flatnonzero(is_training))
-        picks = take(candidates.cameras, np.asarray(selected))
-        num = len(candidates.cameras)
-        places = np.arange(min(num, num_reference)) * num // min(num, num_reference)
-        known, added, reference = (
-            summed_curvature(toolbox, situation, cameras, image_scale)
-            for cameras in (training, picks, take(candidates.cameras, places))
+    def predict(situation: Situation, candidates: Candidates, batches) -> list[dict]:
+        cameras = candidates.cameras
+        num = min(len(cameras), num_reference)
+        places = np.arange(num) * len(cameras) // num
+        is_training = np.flatnonzero(situation.is_training_view)
+        training = take(situation.table.cameras, is_training)
+        known, reference = (
+            summed_curvature(toolbox, situation, some, image_scale)
+            for some in (training, take(cameras, places))
         )
         cell_prior = offset_precision(cell_sides(toolbox.grid), num_rays=situation.num_rays)
         paper_prior = 2.0 * toolbox.laplace.prior_weight
-        distance = distance_gain_db(
-            candidates.cameras.positions, training.positions, picks.positions
-        )
-        return {
-            "variance_db": variance_gain_db(reference, known + cell_prior, added),
-            "paper_prior_db": variance_gain_db(reference, known + paper_prior, added),
-            "information_nats": batch_information(known + paper_prior, added),
-            "views_db": views_gain_db(len(training), len(picks)),
-            "distance_db": distance if math.isfinite(distance) else None,
-        }
+        positions, chosen = np.asarray(cameras.positions), np.asarray(training.positions)
+        predictions = []
+        for batch in batches:
+            picks = take(cameras, np.asarray(batch))
+            added = summed_curvature(toolbox, situation, picks, image_scale)
+            distance = distance_gain_db(positions, chosen, picks.positions)
+            predictions.append(
+                {
+                    "variance_db": variance_gain_db(reference, known + cell_prior, added),
+                    "paper_prior_db": variance_gain_db(reference, known + paper_prior, added),
+                    "information_nats": batch_information(known + paper_prior, added),
+                    "views_db": views_gain_db(len(chosen), len(picks)),
+                    "distance_db": distance if math.isfinite(distance) else None,
+                }
+            )
+            known = known + added
+            chosen = np.concatenate([chosen, np.asarray(picks.positions)])
+        return predictions
 
     return predict
 

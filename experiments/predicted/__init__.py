@@ -20,6 +20,10 @@ The definitions, written down before the runs.
   where it stops and less than x dB was realised, or goes on and x dB or more was. A false stop
   throws x dB or more away; a missed stop takes a batch that was not worth it. The base rate is the
   hit rate of the better of always stopping and never stopping.
+- *Planned*: with `--planned` all batches of a run are predicted from the field of its initial
+  views, each given those before it. This is what can be said where no field can be trained in
+  between, and all that can be said of runs that recorded no predictions. The first batch is the
+  same either way. (This point was added when some runs had ended, before any of it was computed.)
 - *Fit to be told to a user* (`experiments.suggest_views`) is a worth in dB only if, calibrated on
   other scenes, its error is at most 0.8 times that of a constant, and less than that of counting
   views alone; and if the correlation within rounds is more than two standard errors above 0.
