@@ -22,12 +22,14 @@ from bavs_jax.selection.predicted_gain import (
 )
 from bavs_jax.sources import make_candidate_curvature_fn
 from bavs_jax.uncertainty.model import Situation
+from experiments.active_selection import run_all
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
 from experiments.predicted import analysis
 from experiments.predicted.cases import PREDICTORS, run_cases
+from experiments.predicted.planned import comparable_rows
 from experiments.predicted.results import correlation_table, stop_table
-from experiments.predicted_gain import RESULT_FILE, compare
+from experiments.predicted_gain import RESULT_FILE, compare, read_cases
 from experiments.report import ReportError
 from experiments.report.results import load_runs
 from tests import oracles_gain as oracles
@@ -302,6 +304,28 @@ def test_rounds_on_other_test_views_are_left_out(tmp_path):
     del run.rounds[1]["predicted"]
     cases, left_out = run_cases(run)
     assert [case.round for case in cases] == [2, 3] and left_out == 2
+
+
+def test_a_plan_begins_with_what_the_run_itself_predicted(tmp_path):
+    """Runs the real loop, then predicts its batches anew from the checkpoint of round 0."""
+    config = toy_config(predict_gain=True, policies=("random",), num_test_final=2)
+    run_all(config, tmp_path, "python -m experiments.active_selection")
+    recorded, _, _ = read_cases([tmp_path])
+    planned, left_out, _ = read_cases([tmp_path], planned=True)
+    assert [case.round for case in planned] == [1, 2] and left_out == 0
+    for name, value in recorded[0].predicted.items():
+        np.testing.assert_allclose(planned[0].predicted[name], value, rtol=1e-3)  # float32 sums
+    # From the second batch on the field is another one; what needs no field is the same.
+    assert planned[1].predicted["variance_db"] != recorded[1].predicted["variance_db"]
+    for name in ("views_db", "distance_db"):
+        np.testing.assert_allclose(planned[1].predicted[name], recorded[1].predicted[name])
+    assert [case.realised for case in planned] == [case.realised for case in recorded]
+
+
+def test_a_plan_ends_with_the_last_batch_that_can_be_compared():
+    rounds = [{"num_test_views": n, "psnr": 20.0} for n in (25, 25, 25, 200)]
+    assert comparable_rows(rounds) == rounds[1:3]
+    assert comparable_rows(rounds[:1]) == []
 
 
 def test_one_seed_and_scene_are_not_calibrated(tmp_path):

@@ -7,6 +7,7 @@ poses only, so the posterior of the first field can be followed along all of a r
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import pathlib
 from collections.abc import Sequence
 
@@ -20,9 +21,17 @@ from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
 from experiments import runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
+from experiments.predicted.cases import realised_gain
 from experiments.progress import track
 from experiments.report.results import Run as FinishedRun
 from experiments.runner import Run
+
+
+def comparable_rows(rounds: Sequence[dict]) -> list[dict]:
+    """The rows after round 0, up to the last whose gain is known."""
+    pairs = list(itertools.pairwise(rounds))
+    known = [i for i, pair in enumerate(pairs, start=1) if realised_gain(*pair) is not None]
+    return list(rounds[1 : max(known, default=0) + 1])
 
 
 def plan_ahead(folder: pathlib.Path, runs: Sequence[FinishedRun]) -> list[FinishedRun]:
@@ -58,10 +67,11 @@ def plan_ahead(folder: pathlib.Path, runs: Sequence[FinishedRun]) -> list[Finish
         situation = Situation(state.train, state.table, is_training, num_rays)
         candidates = Candidates(take(scene.cameras, pool), pool, ~is_training[pool])
         for run in (run for run in of_kind if run.seed == seed):
-            batches = [[place[v] for v in row["selected"]] for row in run.rounds[1:]]
+            rows = comparable_rows(run.rounds)
+            batches = [[place[view] for view in row["selected"]] for row in rows]
             predictions = predict(situation, candidates, batches)
-            rounds = [run.rounds[0]]
-            rounds += [r | {"predicted": p} for r, p in zip(run.rounds[1:], predictions)]
-            planned.append(dataclasses.replace(run, rounds=rounds))
-            print(f"{run.label}: {len(batches)} batches predicted from the first field")
+            fresh = [row | {"predicted": p} for row, p in zip(rows, predictions)]
+            rest = [row | {"predicted": None} for row in run.rounds[1 + len(rows) :]]
+            planned.append(dataclasses.replace(run, rounds=[run.rounds[0], *fresh, *rest]))
+            print(f"{run.label}: {len(rows)} batches predicted from the first field", flush=True)
     return planned
