@@ -22,16 +22,17 @@ from bavs_jax.selection.predicted_gain import (
 )
 from bavs_jax.sources import make_candidate_curvature_fn
 from bavs_jax.uncertainty.model import Situation
-from experiments.active_selection import run_all
+from experiments import workdir
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
 from experiments.predicted import analysis
 from experiments.predicted.cases import PREDICTORS, run_cases
+from experiments.predicted.compare import compare, read_cases
 from experiments.predicted.planned import comparable_rows
-from experiments.predicted.results import correlation_table, stop_table
-from experiments.predicted_gain import RESULT_FILE, compare, read_cases
+from experiments.predicted.results import RESULT_FILE, correlation_table, stop_table
 from experiments.report import ReportError
 from experiments.report.results import load_runs
+from experiments.runner import Run
 from tests import oracles_gain as oracles
 from tests.report_files import make_result
 from tests.test_active import silent
@@ -279,7 +280,7 @@ def write_runs(folder, *, scene="toy", seeds=(0, 1, 2), policies=("bavs", "rando
 
 def test_command_compares_several_scenes(tmp_path):
     folders = [write_runs(tmp_path / name, scene=name) for name in ("one", "two")]
-    result = compare(folders, tmp_path / "out")
+    result = compare(folders, tmp_path / "out", command="")
     assert json.loads((tmp_path / "out" / RESULT_FILE).read_text()) == result
     assert len(result["cases"]) == 2 * 2 * 3 * 4 and result["left_out"] == 0
     found = result["predictors"]["variance_db"]
@@ -309,7 +310,12 @@ def test_rounds_on_other_test_views_are_left_out(tmp_path):
 def test_a_plan_begins_with_what_the_run_itself_predicted(tmp_path):
     """Runs the real loop, then predicts its batches anew from the checkpoint of round 0."""
     config = toy_config(predict_gain=True, policies=("random",), num_test_final=2)
-    run_all(config, tmp_path, "python -m experiments.active_selection")
+    workdir.claim(tmp_path, config)
+    problem = build_problem(config, load_config_scene(config, cache_dir=None))
+    first = Run(config, problem, tmp_path, None, 0)
+    first.finish()
+    Run(config, problem, tmp_path, "random", 0).finish(first)
+    workdir.collect(tmp_path)
     recorded, _, _ = read_cases([tmp_path])
     planned, left_out, _ = read_cases([tmp_path], planned=True)
     assert [case.round for case in planned] == [1, 2] and left_out == 0
@@ -329,7 +335,7 @@ def test_a_plan_ends_with_the_last_batch_that_can_be_compared():
 
 
 def test_one_seed_and_scene_are_not_calibrated(tmp_path):
-    result = compare([write_runs(tmp_path / "one", seeds=(0,))], tmp_path)
+    result = compare([write_runs(tmp_path / "one", seeds=(0,))], tmp_path, command="")
     assert result["predictors"]["variance_db"]["calibration"] == {"seed": None, "scene": None}
     assert "one seed only" in stop_table(result, "seed").reasons
 
@@ -338,4 +344,4 @@ def test_runs_without_predictions_are_refused_with_the_fix(tmp_path):
     path = tmp_path / "summary.json"
     path.write_text(json.dumps({"schema_version": 1, "runs": [make_result()]}))
     with pytest.raises(ReportError, match="predict_gain=True"):
-        compare([tmp_path], tmp_path)
+        compare([tmp_path], tmp_path, command="")
