@@ -26,8 +26,10 @@ from experiments.report import ReportError
 
 FLAGS = flags.FLAGS
 flags.DEFINE_multi_string("workdir", [], "Folder of an experiment; may be given several times.")
+flags.DEFINE_list("policies", [], "Whose runs to read; by default all.")
 flags.DEFINE_bool("planned", False, "Predict all batches from the field of the initial views.")
 flags.DEFINE_string("out", None, "Folder for the results; by default the first --workdir.")
+flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
 
 
 def main() -> None:
@@ -35,8 +37,15 @@ def main() -> None:
         sys.exit("error: --workdir: is missing; name the folder of a finished experiment")
     folders = [pathlib.Path(folder) for folder in FLAGS.workdir]
     out = pathlib.Path(FLAGS.out) if FLAGS.out else folders[0]
+    if FLAGS.compilation_cache:
+        runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
     try:
-        result = compare(folders, out, command=runtime.command_line(), planned=FLAGS.planned)
+        result = compare(
+            *(folders, out),
+            command=runtime.command_line(),
+            policies=FLAGS.policies,
+            planned=FLAGS.planned,
+        )
     except (ReportError, *USER_ERRORS) as error:
         sys.exit(f"error: {error}")
     print(f"{len(result['cases'])} batches")
