@@ -9,6 +9,7 @@ import pytest
 
 from bavs_jax.cameras import Rays
 from bavs_jax.rendering.compositing import composite, expected_depth, render_weights
+from bavs_jax.rendering.hits import nth_hit, pack_hits
 from bavs_jax.rendering.occupancy import cell_index, init_occupancy, update_occupancy
 from bavs_jax.rendering.packing import evaluate_all_passes, evaluate_one_pass
 from bavs_jax.rendering.render import Channel, render_rays
@@ -85,6 +86,17 @@ def test_march_agrees_with_a_loop():
             continue
         np.testing.assert_allclose(got, want, atol=1e-5)
     assert differing <= 2
+
+
+@pytest.mark.parametrize("num_columns", [1, 31, 32, 33, 192])
+def test_nth_hit_is_that_of_flatnonzero(num_columns):
+    rng = np.random.default_rng(num_columns)
+    hit = rng.random((60, num_columns)) < np.linspace(0.0, 1.0, 60)[:, None]  # none to all
+    hits = pack_hits(jnp.asarray(hit))
+    np.testing.assert_array_equal(hits.total, hit.sum(1))
+    columns = nth_hit(hits, jnp.tile(jnp.arange(num_columns), (60, 1)))
+    for row, found in zip(hit, np.asarray(columns)):
+        np.testing.assert_array_equal(found[: row.sum()], np.flatnonzero(row))
 
 
 def test_valid_slots_come_first_and_cover_what_is_occupied():

@@ -37,8 +37,33 @@ def _read_back(packed, starts, first, sample_mask):
     return jnp.where(here.reshape(here.shape + (1,) * (packed.ndim - 1)), table, 0)
 
 
+@jax.custom_vjp
+def _read_back_once(packed, starts, kept, places):
+    """`_read_back` of a single pass, with a gradient that gathers.
+
+    Each place goes to one slot at most, so its cotangent is that slot's. The derivative of a
+    gather would add all [R, S] slots, most of them empty, into the K places one by one.
+    """
+    del places
+    return _read_back(packed, starts, 0, kept)
+
+
+def _read_back_once_fwd(packed, starts, kept, places):
+    return _read_back(packed, starts, 0, kept), places
+
+
+def _read_back_once_bwd(places, cotangent):
+    row, slot, is_read = places
+    values = cotangent.reshape(-1, *cotangent.shape[2:])[row * cotangent.shape[1] + slot]
+    is_read = is_read.reshape(is_read.shape + (1,) * (values.ndim - 1))
+    return jnp.where(is_read, values, 0), None, None, None
+
+
+_read_back_once.defvjp(_read_back_once_fwd, _read_back_once_bwd)
+
+
 def evaluate_one_pass(fn: Callable, sample_mask: jax.Array, *, capacity: int):
-    """Differentiable: as many whole rays as fit into one buffer.
+    """Differentiable in reverse: as many whole rays as fit into one buffer.
 
     Args:
       fn: (row [K], slot [K], valid [K]) -> pytree of [K, ...]; `row`, `slot` say which sample.
@@ -51,9 +76,10 @@ def evaluate_one_pass(fn: Callable, sample_mask: jax.Array, *, capacity: int):
     """
     starts, count = row_starts(sample_mask)
     ray_mask = starts + count <= capacity
-    packed = fn(*_packed_slots(starts, count, 0, capacity))
-    kept = sample_mask & ray_mask[:, None]
-    return jax.tree.map(lambda x: _read_back(x, starts, 0, kept), packed), ray_mask
+    row, slot, valid = _packed_slots(starts, count, 0, capacity)
+    packed = fn(row, slot, valid)
+    kept, places = sample_mask & ray_mask[:, None], (row, slot, valid & ray_mask[row])
+    return jax.tree.map(lambda x: _read_back_once(x, starts, kept, places), packed), ray_mask
 
 
 def evaluate_all_passes(fn: Callable, sample_mask: jax.Array, *, capacity: int):

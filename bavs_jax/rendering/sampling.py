@@ -9,6 +9,7 @@ from flax import struct
 
 from bavs_jax.cameras import Rays
 from bavs_jax.numerics import safe_reciprocal
+from bavs_jax.rendering.hits import nth_hit, pack_hits
 from bavs_jax.rendering.occupancy import Occupancy, cell_index
 
 
@@ -101,13 +102,11 @@ def march(
     cell = cell_index(occupancy, positions)
     hit = occupancy.occupied.at[cell].get(mode="promise_in_bounds") & (t < t_leave[:, None])
 
-    rank = jnp.cumsum(hit.astype(jnp.int32), axis=1)  # 1-based number of a hit in its row
-    total = rank[:, -1]
+    hits = pack_hits(hit)
+    total = hits.total
     stride = jnp.maximum((total + num_slots - 1) // num_slots, 1)
     count = (total + stride - 1) // stride
-    # Slot m holds the hit number m * stride + 1.
-    wanted = jnp.arange(num_slots) * stride[:, None] + 1
-    step = _first_step_with_rank(rank, wanted)
+    step = nth_hit(hits, jnp.arange(num_slots) * stride[:, None])
     sample_mask = jnp.arange(num_slots) < count[:, None]
     t_mids = t_enter[:, None] + (step + place[:, None]) * step_size
     deltas = jnp.where(sample_mask, (step_size * stride)[:, None], 0.0)
@@ -117,19 +116,3 @@ def march(
         sample_mask=sample_mask,
         thinned=total > num_slots,
     )
-
-
-def _first_step_with_rank(rank: jax.Array, wanted: jax.Array) -> jax.Array:
-    """For each row, the first column where `rank >= wanted`, by binary search; [R, S] int."""
-    num_rays, num_steps = rank.shape
-    rows = (jnp.arange(num_rays) * num_steps)[:, None]
-    flat = rank.reshape(-1)
-    below = jnp.zeros_like(wanted)  # columns known to be too small
-    stride = 1 << (num_steps - 1).bit_length()
-    while stride:
-        probe = below + stride
-        column = jnp.minimum(probe, num_steps) - 1
-        value = flat.at[rows + column].get(mode="promise_in_bounds")
-        below = jnp.where((probe <= num_steps) & (value < wanted), probe, below)
-        stride >>= 1
-    return jnp.minimum(below, num_steps - 1)
