@@ -33,6 +33,7 @@ def write_page(path: pathlib.Path, *, cases: Sequence[Case], result: dict) -> No
         scenes=", ".join(dict.fromkeys(case.scene for case in cases)),
         num_cases=len(cases),
         left_out=result["left_out"],
+        planned=result["planned"],
         commands=result["commands"],
         plots=[Markup(gain_plot(cases, name)) for name in result["predictors"]],
         correlations=correlation_table(result),
