@@ -14,6 +14,7 @@ import numpy as np
 from bavs_jax import active
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.metrics.perceptual import make_lpips_fn
+from bavs_jax.prediction import make_predict_fn
 from bavs_jax.scenes import Scene
 from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
@@ -197,9 +198,14 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
         )
 
     def make_step(policy_name: str, initial, track: Callable, label: str):
+        predict = None
+        if config.predict_gain:
+            predict = make_predict_fn(
+                make_toolbox(track), image_scale=config.candidates.image_scale
+            )
         return active.make_active_step(
             get_policy(policy_name),
-            active.Stages(trainer.call, restart, sources_fn(track)),
+            active.Stages(trainer.call, restart, sources_fn(track), predict),
             source,
             centre=scene.centre,
             batch_size=config.batch_size,

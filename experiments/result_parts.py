@@ -7,6 +7,8 @@ import pathlib
 from functools import partial
 
 from experiments.posthoc.tables import TABLES as POSTHOC_TABLES
+from experiments.predicted.results import RESULT_FILE as GAIN_FILE
+from experiments.predicted.results import correlation_table, stop_table
 from experiments.report import ReportError
 from experiments.report import tables as run_tables
 from experiments.report.results import load_runs
@@ -58,9 +60,18 @@ def posthoc_parts(make_table, path: pathlib.Path) -> list[Part]:
     return [made_by(result, over), make_table(result["rows"])]
 
 
+def gain_parts(path: pathlib.Path) -> list[Part]:
+    """How well predicted gains tell realised ones, and the stop rule tried on left-out seeds."""
+    result = json.loads(path.read_text(encoding="utf-8"))
+    made = "; ".join(f"`{command}`" for command in result["commands"])
+    tables = [correlation_table(result), stop_table(result, "seed")]
+    return [f"{made}: {len(result['cases'])} batches", *tables]
+
+
 PARTS = {
     "summary.json": run_parts,
     uncertain.NAME: uncertainty_parts,
+    GAIN_FILE: gain_parts,
     **{name: partial(posthoc_parts, make) for name, make in POSTHOC_TABLES.items()},
 }
 

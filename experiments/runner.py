@@ -22,6 +22,7 @@ from experiments.build_scene import initial_views
 from experiments.evaluate import evaluate_views, picture_arrays, spread_evenly
 from experiments.files import append_line, write_arrays, write_json
 from experiments.machine import device_name, peak_memory_mb, versions
+from experiments.predicted.cases import realised_gain
 from experiments.progress import track
 from experiments.report.choices import bound_words
 
@@ -133,6 +134,7 @@ class Run:
                 int(info.survivors_farthest_overlap) if info.filter else None
             ),
             "batch_bound": info.bound._asdict() if info.bound else None,
+            "predicted": choice.predicted,
         }
         self._log(event="choice", round=number, **self.pending)
         if info.bound:
@@ -157,6 +159,8 @@ class Run:
             pending["selected"] = self.initial.tolist()
         pending["seconds"]["evaluate"] = time.monotonic() - start
         row = {"num_views": int(state.is_training_view.sum()), **pending, **measures}
+        if self.rounds:
+            row["realised_db"] = realised_gain(self.rounds[-1], row)
         self.rounds.append(row)
         self.pending = _new_pending()
         self._save(state)
@@ -253,7 +257,7 @@ class Run:
 
 
 def _new_pending() -> dict:
-    names = ("train", "curvature", "fit", "score", "select", "evaluate")
+    names = ("train", "curvature", "fit", "score", "select", "predict", "evaluate")
     return {"selected": [], "seconds": dict.fromkeys(names, 0.0)}
 
 

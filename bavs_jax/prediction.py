@@ -1,0 +1,138 @@
+"""Predicts, from the field and its posterior alone, what a chosen batch will be worth.
+
+Definitions and formulas are in `selection/predicted_gain.py`; this gathers what they are made of.
+Every curvature is summed over images of a reduced size and scaled up to the pixels of the photos,
+so that a prediction costs about as much as to look at the candidates once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from bavs_jax.cameras import Cameras, num_pixels, take
+from bavs_jax.candidates import Candidates
+from bavs_jax.fields.contraction import scene_positions
+from bavs_jax.fields.deformation import DeformationGrid, vertices_in_box
+from bavs_jax.selection.predicted_gain import (
+    batch_information,
+    distance_gain_db,
+    offset_precision,
+    variance_gain_db,
+    views_gain_db,
+)
+from bavs_jax.sources import WEIGHTING
+from bavs_jax.uncertainty.model import Situation, Toolbox
+from bavs_jax.uncertainty.scoring import reduced_cameras
+
+# Candidates, evenly spaced in their order, whose rays stand for those of test views.
+NUM_REFERENCE = 16
+
+
+def make_predict_fn(
+    toolbox: Toolbox, *, image_scale: float, num_reference: int = NUM_REFERENCE
+) -> Callable:
+    """Makes `predict(situation, candidates, batches) -> list of dicts`, one for each batch.
+
+    `batches` are candidates' indices [k] each, taken one after another: what is predicted of the
+    second is what it adds to the first. The field stays that of the situation. By each definition
+    one number:
+
+    - `variance_db`: the predicted gain, dB, with a prior of one grid cell (`variance_gain_db`).
+    - `paper_prior_db`: the same with the paper's prior, `2 lambda`.
+    - `information_nats`: what the batch tells of the offsets, with the paper's prior.
+    - `views_db`: from the number of views alone.
+    - `distance_db`: from camera positions alone, over all candidates; None where it is infinite.
+
+    Reference rays are those of candidates, chosen views among them: where one may stand is where
+    one wants to be right.
+
+    Args:
+      toolbox: the parts of a scene.
+      image_scale: of width and height of the images that are looked at.
+      num_reference: views whose rays are the reference.
+    """
+
+    def predict(situation: Situation, candidates: Candidates, batches) -> list[dict]:
+        cameras = candidates.cameras
+        num = min(len(cameras), num_reference)
+        places = np.arange(num) * len(cameras) // num
+        is_training = np.flatnonzero(situation.is_training_view)
+        training = take(situation.table.cameras, is_training)
+        known, reference = (
+            summed_curvature(toolbox, situation, some, image_scale)
+            for some in (training, take(cameras, places))
+        )
+        cell_prior = offset_precision(cell_sides(toolbox.grid), num_rays=situation.num_rays)
+        paper_prior = 2.0 * toolbox.laplace.prior_weight
+        positions, chosen = np.asarray(cameras.positions), np.asarray(training.positions)
+        predictions = []
+        for batch in batches:
+            picks = take(cameras, np.asarray(batch))
+            added = summed_curvature(toolbox, situation, picks, image_scale)
+            distance = distance_gain_db(positions, chosen, picks.positions)
+            predictions.append(
+                {
+                    "variance_db": variance_gain_db(reference, known + cell_prior, added),
+                    "paper_prior_db": variance_gain_db(reference, known + paper_prior, added),
+                    "information_nats": batch_information(known + paper_prior, added),
+                    "views_db": views_gain_db(len(chosen), len(picks)),
+                    "distance_db": distance if math.isfinite(distance) else None,
+                }
+            )
+            known = known + added
+            chosen = np.concatenate([chosen, np.asarray(picks.positions)])
+        return predictions
+
+    return predict
+
+
+def cell_sides(grid: DeformationGrid) -> np.ndarray:
+    """Sides of a cell in the middle of the grid, [3] scene units: of all cells in the scene box."""
+    unit = np.full((2, 3), 0.5, np.float32)
+    unit[1] += 1.0 / grid.cells
+    lower, upper = np.asarray(scene_positions(grid.box, unit, contracted=grid.contracted))
+    return np.asarray(upper - lower, np.float64)
+
+
+def summed_curvature(
+    toolbox: Toolbox, situation: Situation, cameras: Cameras, image_scale: float
+) -> np.ndarray:
+    """What the photos of all n cameras together add to the precision, [G, 3] float64 >= 0.
+
+    As `make_candidate_curvature_fn`, but one sum over all cameras. Views of different sizes are
+    scaled up together, in proportion to the pixels of their reduced images.
+    """
+    table, small = situation.table, reduced_cameras(cameras, image_scale)
+    small_rays = np.asarray(num_pixels(small))
+    total = np.zeros((toolbox.grid.num_vertices, 3))
+    # The cameras stand in for the first views, so that all arrays keep the table's shapes and
+    # nothing is compiled anew; their pixels are not looked at.
+    most = len(table.cameras)
+    for rows in np.array_split(np.arange(len(cameras)), -(-len(cameras) // most)):
+        stand_in = jax.tree.map(
+            lambda old, new, rows=rows: np.concatenate(
+                [np.asarray(new)[rows].astype(old.dtype), np.asarray(old)[len(rows) :]]
+            ),
+            table.cameras,
+            small,
+        )
+        total += np.asarray(
+            toolbox.curvature(
+                situation.train,
+                table.replace(cameras=stand_in),
+                np.repeat(np.arange(len(rows)), small_rays[rows]).astype(np.int32),
+                np.concatenate([np.arange(n, dtype=np.int32) for n in small_rays[rows]]),
+                None,
+                weighting=WEIGHTING,
+            ),
+            np.float64,
+        )
+    if toolbox.laplace.extent == "box":
+        total *= np.asarray(vertices_in_box(toolbox.grid))[:, None]
+    # A sum of squares that was summed in another order may fall short of 0 by its rounding.
+    scale = 2.0 / situation.num_rays * np.asarray(num_pixels(cameras)).sum() / small_rays.sum()
+    return scale * np.maximum(total, 0.0)
