@@ -15,8 +15,7 @@ import numpy as np
 
 from bavs_jax.cameras import Cameras, num_pixels, take
 from bavs_jax.candidates import Candidates
-from bavs_jax.fields.contraction import scene_positions
-from bavs_jax.fields.deformation import DeformationGrid, vertices_in_box
+from bavs_jax.fields.deformation import cell_sides, vertices_in_box
 from bavs_jax.selection.predicted_gain import (
     batch_information,
     distance_gain_db,
@@ -88,14 +87,6 @@ def make_predict_fn(
         return predictions
 
     return predict
-
-
-def cell_sides(grid: DeformationGrid) -> np.ndarray:
-    """Sides of a cell in the middle of the grid, [3] scene units: of all cells in the scene box."""
-    unit = np.full((2, 3), 0.5, np.float32)
-    unit[1] += 1.0 / grid.cells
-    lower, upper = np.asarray(scene_positions(grid.box, unit, contracted=grid.contracted))
-    return np.asarray(upper - lower, np.float64)
 
 
 def summed_curvature(

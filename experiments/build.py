@@ -256,6 +256,7 @@ def _laplace_options(config) -> LaplaceOptions:
         scale=options.scale,
         extent=options.extent,
         max_rays=options.max_rays or None,
+        offset_cells=options.offset_cells,
     )
 
 

@@ -39,3 +39,16 @@ def dense_jacobian(field_fn, grid, rays, samples, background):
         return colours_with_offsets(field_fn, grid, rays, samples, background, theta)
 
     return jax.jacrev(colours)(jnp.zeros((grid.num_vertices, 3)))
+
+
+def dense_depth_jacobian(field_fn, grid, rays, samples):
+    """The full derivative of expected depths dD_r / dtheta_vd, [R, G, 3]."""
+    positions = rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]
+    directions = jnp.broadcast_to(rays.directions[:, None], positions.shape)
+
+    def depths(theta):
+        density, _ = field_fn(positions + displace(grid, theta, positions), directions)
+        weights = render_weights(density, samples.deltas)
+        return (weights * samples.t_mids).sum(-1) / weights.sum(-1)
+
+    return jax.jacrev(depths)(jnp.zeros((grid.num_vertices, 3)))

@@ -9,8 +9,8 @@ import pytest
 
 from bavs_jax.active import init_active_state
 from bavs_jax.cameras import num_pixels, take
-from bavs_jax.fields.deformation import DeformationGrid, vertex_positions
-from bavs_jax.prediction import cell_sides, make_predict_fn, summed_curvature
+from bavs_jax.fields.deformation import DeformationGrid, cell_sides, vertex_positions
+from bavs_jax.prediction import make_predict_fn, summed_curvature
 from bavs_jax.selection.information import log_det_gain
 from bavs_jax.selection.predicted_gain import (
     batch_information,

@@ -54,6 +54,14 @@ def vertex_positions(grid: DeformationGrid) -> jax.Array:
     return scene_positions(grid.box, unit, contracted=grid.contracted)
 
 
+def cell_sides(grid: DeformationGrid) -> np.ndarray:
+    """Sides of a cell in the middle of the grid, [3] scene units: of all cells in the scene box."""
+    unit = np.full((2, 3), 0.5, np.float32)
+    unit[1] += 1.0 / grid.cells
+    lower, upper = np.asarray(scene_positions(grid.box, unit, contracted=grid.contracted))
+    return np.asarray(upper - lower, np.float64)
+
+
 def vertices_in_box(grid: DeformationGrid) -> jax.Array:
     """Which vertices lie in the scene box, [G] bool: all of them where space is not contracted."""
     return in_box(jnp.asarray(unit_vertices(grid)), contracted=grid.contracted)

@@ -36,8 +36,7 @@ import math
 
 import numpy as np
 
-# Squared colour error per channel that a trained field leaves on its own photos: 30 dB.
-NOISE_VARIANCE = 1e-3
+from bavs_jax.uncertainty.posterior import NOISE_VARIANCE
 
 
 def offset_precision(

@@ -11,6 +11,7 @@ No prior, factor or division is in `jac_sq_sum`; `posterior.py` adds them.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -64,17 +65,24 @@ def colour_jacobian(
     )
 
 
-def split_colour_jacobian(
-    field_fn: Callable, rays: Rays, samples: Samples, *, background, inputs: dict | None = None
-) -> tuple[jax.Array, jax.Array]:
-    """As `colour_jacobian`, by the chain rule at the samples' densities and colours.
+class FieldSlopes(NamedTuple):
+    """A field at the samples of R rays, and its derivatives by their positions."""
 
-    `dC / dx_i = dC / dsigma_i dsigma_i / dx_i + dC / dc_i dc_i / dx_i`: compositing has three
-    outputs and is differentiated per ray by `jax.vmap(jax.jacrev(...))`; the field has three
-    inputs per sample and is differentiated forwards, all samples of all rays at once, for which
-    the field is evaluated three times rather than differentiated three times in reverse.
+    density: jax.Array  # [R, S]
+    rgb: jax.Array  # [R, S, 3]
+    density_slope: jax.Array  # [R, S, 3 axes]
+    rgb_slope: jax.Array  # [R, S, 3 channels, 3 axes]
+
+
+def field_slopes(
+    field_fn: Callable, rays: Rays, samples: Samples, *, inputs: dict | None = None
+) -> FieldSlopes:
+    """Reads and differentiates a field at samples; arguments as in `colour_jacobian`.
+
+    The field has three inputs per sample and is differentiated forwards, all samples of all rays
+    at once, for which it is evaluated three times rather than differentiated four times in reverse.
     """
-    positions = rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]
+    positions = sample_positions(rays, samples)
     directions = jnp.broadcast_to(rays.directions[:, None], positions.shape)
     flat_directions = directions.reshape(-1, 3)
     flat_inputs = flatten_inputs(inputs or {})
@@ -88,19 +96,46 @@ def split_colour_jacobian(
 
     values, slopes = zip(*(along(axis) for axis in jnp.eye(3, dtype=positions.dtype)))
     shape = samples.t_mids.shape
-    density, rgb = values[0][0].reshape(shape), values[0][1].reshape(*shape, 3)
-    density_slope = jnp.stack([d for d, _ in slopes], -1).reshape(*shape, 3)  # [R, S, axis]
-    rgb_slope = jnp.stack([c for _, c in slopes], -1).reshape(*shape, 3, 3)  # [R, S, c, axis]
+    return FieldSlopes(
+        density=values[0][0].reshape(shape),
+        rgb=values[0][1].reshape(*shape, 3),
+        density_slope=jnp.stack([d for d, _ in slopes], -1).reshape(*shape, 3),
+        rgb_slope=jnp.stack([c for _, c in slopes], -1).reshape(*shape, 3, 3),
+    )
+
+
+def split_colour_jacobian(
+    field_fn: Callable, rays: Rays, samples: Samples, *, background, inputs: dict | None = None
+) -> tuple[jax.Array, jax.Array]:
+    """As `colour_jacobian`, by the chain rule at the samples' densities and colours.
+
+    `dC / dx_i = dC / dsigma_i dsigma_i / dx_i + dC / dc_i dc_i / dx_i`: compositing has three
+    outputs and is differentiated per ray by `jax.vmap(jax.jacrev(...))`, the field by
+    `field_slopes`.
+    """
+    slopes = field_slopes(field_fn, rays, samples, inputs=inputs)
+    return composited_jacobian(slopes, samples.deltas, background=background)
+
+
+def composited_jacobian(
+    slopes: FieldSlopes, deltas: jax.Array, *, background
+) -> tuple[jax.Array, jax.Array]:
+    """The Jacobian [R, 3, S, 3] and the colours [R, 3] of `split_colour_jacobian`."""
 
     def ray_colour(density, rgb, deltas):
         colour = composite_colour(render_weights(density, deltas), rgb, background)
         return colour, colour
 
     (by_density, by_rgb), colour = jax.vmap(jax.jacrev(ray_colour, argnums=(0, 1), has_aux=True))(
-        density, rgb, samples.deltas
+        slopes.density, slopes.rgb, deltas
     )
-    jacobian = by_density[..., None] * density_slope[:, None]
-    return jacobian + jnp.einsum("rcsk,rskd->rcsd", by_rgb, rgb_slope), colour
+    jacobian = by_density[..., None] * slopes.density_slope[:, None]
+    return jacobian + jnp.einsum("rcsk,rskd->rcsd", by_rgb, slopes.rgb_slope), colour
+
+
+def sample_positions(rays: Rays, samples: Samples) -> jax.Array:
+    """Where samples are, [R, S, 3] scene units."""
+    return rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]
 
 
 def weight_jacobian(jacobian: jax.Array, residual: jax.Array | None, weighting: str) -> jax.Array:
@@ -191,8 +226,7 @@ def add_jac_sq_sum(
     jacobian, rgb = jacobian_fn(field_fn, rays, samples, background=background, inputs=inputs)
     residual = None if target is None else rgb - target
     jacobian = weight_jacobian(jacobian, residual, weighting)
-    positions = rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]
-    positions = computed_once(positions)
+    positions = computed_once(sample_positions(rays, samples))
     rows, added = jax.vmap(vertex_squares, in_axes=(None, 0, 0))(grid, positions, jacobian)
     if ray_weight is not None:
         added = added * ray_weight[:, None, None, None]

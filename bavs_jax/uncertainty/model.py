@@ -60,6 +60,7 @@ class LaplaceOptions(NamedTuple):
     scale: str = "log"
     extent: str = "box"
     max_rays: int | None = None  # in the curvature; a uniform subset stands for more
+    offset_cells: float = 0.3  # offsets a priori, standard deviation in cells (`offset_variance`)
 
 
 class Toolbox(NamedTuple):

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
+
+NOISE_VARIANCE = 1e-3  # squared colour error per channel that a field leaves on its photos: 30 dB
 
 # Curvature of the mean loss per unit of the raw sum: H = (factor / R) jac_sq_sum + 2 lambda.
 _FACTORS = {"eq13": 2.0, "eq11": 4.0, "empirical": 4.0}
@@ -41,6 +44,24 @@ def laplace_variance(precision: jax.Array) -> jax.Array:
     A vertex that no ray has seen keeps the prior's `1 / (2 lambda)`.
     """
     return 1.0 / precision
+
+
+def offset_variance(
+    jac_sq_sum: jax.Array, offset_std, *, noise_variance: float = NOISE_VARIANCE
+) -> jax.Array:
+    """Variance of each offset in its own units, `1 / (jac_sq_sum / s^2 + 1 / std^2)`, scene unit^2.
+
+    The posterior of a linear model: colours are known up to a noise of variance s^2, and offsets
+    are a priori normal with standard deviation `std`. It is `laplace_variance` of the mean loss,
+    times `2 s^2 / R`, with `lambda = s^2 / (R std^2)`. The paper's `lambda` stands for offsets of
+    many scene sizes, where nothing is linear any more.
+
+    Args:
+      jac_sq_sum: [G, 3] raw sum over the training rays, weighting `eq13`.
+      offset_std: `std`, [3] or a number > 0, scene units.
+      noise_variance: s^2 > 0, per colour channel.
+    """
+    return 1.0 / (jac_sq_sum / noise_variance + 1.0 / jnp.square(jnp.asarray(offset_std)))
 
 
 def bayesrays_vertex_variance(jac_sq_sum: jax.Array, *, num_rays, prior_weight) -> jax.Array:

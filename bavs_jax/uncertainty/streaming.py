@@ -39,6 +39,33 @@ def curvature_group_size(num_vertices: int, num_views: int) -> int:
     return max(1, min(MAX_GROUP, fitting, num_views))
 
 
+def bucket_sizes(sampler: Sampler, sizes: tuple[int, ...] = (8, 16, 32, 64)) -> tuple[int, ...]:
+    """Sample slots of each compiled shape: those below the sampler's `num_slots`, and that.
+
+    A dense sampler, all of whose slots are filled, has one bucket.
+    """
+    slots = sampler.num_slots
+    return (*(() if sampler.dense else sorted(b for b in sizes if b < slots)), slots)
+
+
+def bucketed_rows(counts: np.ndarray, buckets: tuple[int, ...], chunk_samples: int):
+    """Rays by bucket: yields (bucket, rows [chunk_samples // bucket], how many of them are true).
+
+    Rays of no samples are left out; the last rows of a bucket are filled up with copies.
+
+    Args:
+      counts: [N] samples of each ray.
+      buckets: ascending, from `bucket_sizes`.
+      chunk_samples: slots of one compiled call.
+    """
+    smaller = 0
+    for bucket in buckets:
+        members = np.flatnonzero((counts > smaller) & (counts <= bucket))
+        smaller = bucket
+        for rows, num in _chunks(members, max(chunk_samples // bucket, 1)):
+            yield bucket, rows, num
+
+
 def make_curvature_fn(
     field: Field,
     sampler: Sampler,
@@ -70,9 +97,7 @@ def make_curvature_fn(
       rays; `group_ids` [N] int says which ray is of which, by default all are of group 0.
       `progress_fn(n)` is called with the number of rays done.
     """
-    slots = sampler.num_slots
-    buckets = () if sampler.dense else buckets
-    buckets = tuple(sorted({b for b in buckets if b < slots} | {slots}))
+    slots, buckets = sampler.num_slots, bucket_sizes(sampler, buckets)
     background = None if background is None else jnp.asarray(background, jnp.float32)
     count_chunk = 8192
 
@@ -129,26 +154,21 @@ def make_curvature_fn(
         counts = all_counts(params, sampler_state, table, view_ids, within)
         report = progress_fn or (lambda num: None)
         report(int((counts == 0).sum()))
-        smaller = 0
-        for bucket in buckets:
-            members = np.flatnonzero((counts > smaller) & (counts <= bucket))
-            smaller = bucket
-            chunk = max(chunk_samples // bucket, 1)
-            for rows, num in _chunks(members, chunk):
-                total = add_chunk(
-                    total,
-                    params,
-                    sampler_state,
-                    table,
-                    view_ids[rows],
-                    within[rows],
-                    group_ids[rows],
-                    (np.arange(chunk) < num).astype(np.float32),
-                    bucket=bucket,
-                )
-                # The host would otherwise run ahead and queue every chunk's buffers at once.
-                jax.block_until_ready(total)
-                report(num)
+        for bucket, rows, num in bucketed_rows(counts, buckets, chunk_samples):
+            total = add_chunk(
+                total,
+                params,
+                sampler_state,
+                table,
+                view_ids[rows],
+                within[rows],
+                group_ids[rows],
+                (np.arange(len(rows)) < num).astype(np.float32),
+                bucket=bucket,
+            )
+            # The host would otherwise run ahead and queue every chunk's buffers at once.
+            jax.block_until_ready(total)
+            report(num)
         return total.reshape(num_groups, grid.num_vertices, 3)
 
     return curvature

@@ -122,13 +122,16 @@ def get_config() -> ConfigDict:
     config.uncertainty.variant = "posterior"  # "posterior" or "bayesrays"
     config.uncertainty.scale = "log"  # "log": log10 sigma on [0, 1]; "sigma"
     config.uncertainty.extent = "box"  # what counts: the scene "box", or all "space" around it too
+    config.uncertainty.offset_cells = 0.3  # of "laplace_predictive": offsets a priori, in cells
     config.uncertainty.flow_draws = 16  # of "cf_nerf" when rendering; 32 in its paper
     config.uncertainty.ensemble_size = 3  # fields, the run's own among them
     config.uncertainty.max_rays = 0  # training rays in the curvature; 0: all
 
     # --- experiments.evaluate_uncertainty ---
     config.evaluation = ConfigDict()
-    config.evaluation.models = ("laplace", "cf_nerf", "learned_variance", "ensemble", "entropy")
+    config.evaluation.models = (
+        *("laplace", "laplace_predictive", "cf_nerf", "learned_variance", "ensemble", "entropy"),
+    )
     config.evaluation.num_views = 50  # test views of AUSE, evenly spaced; 0: all
     config.evaluation.scale_depth = False  # one factor for all depths, where their unit is unknown
     config.evaluation.variant = "depth_mae_per_image"  # that the page shows first

@@ -1,0 +1,154 @@
+"""What uncertain offsets mean for pixels: the linearised Laplace predictive variance.
+
+Offsets theta of the deformation grid move a ray's colour and depth by `g . theta` to first order,
+so under a posterior with variances v of independent offsets
+
+    Var C_rc = sum_vd g_rcvd^2 v_vd,      Var D_r = sum_vd g_rDvd^2 v_vd,
+
+with the same derivatives g that make the curvature (Eqs 10-13). Where the paper renders how far a
+point may be displaced (Fig 4), this says what the displacement would change: nothing inside of an
+even surface, much where a ray grazes an edge or ends in fog.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from bavs_jax.cameras import Rays
+from bavs_jax.fields.base import Field
+from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.numerics import computed_once
+from bavs_jax.rendering.compositing import expected_depth, render_weights
+from bavs_jax.rendering.samplers import Sampler
+from bavs_jax.rendering.sampling import Samples, first_slots
+from bavs_jax.uncertainty.curvature import (
+    FieldSlopes,
+    composited_jacobian,
+    field_slopes,
+    sample_positions,
+    vertex_squares,
+)
+from bavs_jax.uncertainty.streaming import bucket_sizes, bucketed_rows
+
+
+def depth_jacobian(slopes: FieldSlopes, samples: Samples) -> tuple[jax.Array, jax.Array]:
+    """Derivative of each ray's expected depth by an offset of each of its samples.
+
+    `dD_r / dx_id = dD_r / dsigma_i dsigma_i / dx_id`. Sample positions are held fixed.
+
+    Args:
+      slopes: from `field_slopes`.
+      samples: [R, S].
+
+    Returns:
+      jacobian [R, 1, S, 3], without unit, and the depths [R], scene units.
+    """
+
+    def ray_depth(density, deltas, t_mids):
+        depth = expected_depth(render_weights(density, deltas), t_mids)
+        return depth, depth
+
+    by_density, depth = jax.vmap(jax.grad(ray_depth, has_aux=True))(
+        slopes.density, samples.deltas, samples.t_mids
+    )
+    return (by_density[..., None] * slopes.density_slope)[:, None], depth
+
+
+def predictive_variance(
+    grid: DeformationGrid, positions: jax.Array, jacobian: jax.Array, variance: jax.Array
+) -> jax.Array:
+    """`sum_c sum_vd g_rcvd^2 v_vd` of each ray.
+
+    Args:
+      grid: the deformation grid.
+      positions: [R, S, 3] of samples, scene units.
+      jacobian: [R, C, S, 3] derivatives of C quantities by each sample's offset.
+      variance: v [G, 3] of the offsets, scene unit^2.
+
+    Returns:
+      [R] >= 0, summed over the C quantities, in their unit squared.
+
+    Numerics: a sum of squares that is made in another order may fall short of 0 by its rounding,
+    and is clipped.
+    """
+    rows, squares = jax.vmap(vertex_squares, in_axes=(None, 0, 0))(grid, positions, jacobian)
+    weights = variance.at[rows].get(mode="promise_in_bounds")  # [R, S, 8, 3]
+    return jnp.maximum((squares * weights).sum((1, 2, 3)), 0.0)
+
+
+def make_predictive_fn(
+    field: Field,
+    sampler: Sampler,
+    grid: DeformationGrid,
+    *,
+    background,
+    chunk_samples: int = 8192,
+) -> Callable:
+    """Makes `render(params, sampler_state, variance [G, 3], rays [R]) -> images`.
+
+    Images are "rgb", "depth", "opacity", "thinned", and the standard deviations "uncertainty", of
+    colour (root mean square over the channels), and "depth_uncertainty", scene units; all [R, ...]
+    on the host. Rays are put into buckets by their samples, as for the curvature, so `render`
+    itself must not be jitted. A ray that meets nothing is certain.
+
+    Args:
+      field, sampler, grid, background: see `make_curvature_fn`.
+      chunk_samples: slots of one compiled call.
+    """
+    buckets = bucket_sizes(sampler)
+    background = None if background is None else jnp.asarray(background, jnp.float32)
+
+    @jax.jit
+    def count_samples(params, sampler_state, rays):
+        samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
+        return samples.sample_mask.sum(-1)
+
+    @partial(jax.jit, static_argnames="bucket")
+    def render_bucket(params, sampler_state, variance, rays, *, bucket):
+        samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
+        samples = first_slots(samples, bucket)
+        inputs = field.inputs(rays, samples)
+        slopes = field_slopes(partial(field.apply, params["field"]), rays, samples, inputs=inputs)
+        by_colour, rgb = composited_jacobian(slopes, samples.deltas, background=background)
+        by_depth, depth = depth_jacobian(slopes, samples)
+        positions = computed_once(sample_positions(rays, samples))
+        deviation = [
+            jnp.sqrt(predictive_variance(grid, positions, jacobian, variance) / jacobian.shape[1])
+            for jacobian in (by_colour, by_depth)
+        ]
+        return {
+            "rgb": rgb,
+            "depth": depth,
+            "opacity": render_weights(slopes.density, samples.deltas).sum(-1),
+            "thinned": samples.thinned,
+            "uncertainty": deviation[0],
+            "depth_uncertainty": deviation[1],
+        }
+
+    def render(params, sampler_state, variance, rays: Rays) -> dict[str, np.ndarray]:
+        num = len(rays.origins)
+        counts = np.asarray(count_samples(params, sampler_state, rays))
+        images, rays = _empty_images(num, background), jax.tree.map(np.asarray, rays)
+        for bucket, rows, count in bucketed_rows(counts, buckets, chunk_samples):
+            some = jax.tree.map(lambda x, rows=rows: x[rows], rays)
+            found = render_bucket(params, sampler_state, variance, some, bucket=bucket)
+            for name, values in found.items():
+                images[name][rows[:count]] = np.asarray(values)[:count]
+        return images
+
+    return render
+
+
+def _empty_images(num: int, background) -> dict[str, np.ndarray]:
+    """What `num` rays show that meet nothing."""
+    images = {name: np.zeros(num, np.float32) for name in ("depth", "opacity")}
+    images |= {name: np.zeros(num, np.float32) for name in ("uncertainty", "depth_uncertainty")}
+    colour = np.zeros(3) if background is None else np.asarray(background)
+    images["rgb"] = np.tile(colour.astype(np.float32), (num, 1))
+    images["thinned"] = np.zeros(num, bool)
+    return images
