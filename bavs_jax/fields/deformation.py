@@ -83,7 +83,31 @@ def trilinear_weights(grid: DeformationGrid, positions: jax.Array, vertices: jax
       [...] in [0, 1]; 0 for vertices that are not corners of the position's cell.
     """
     distance = jnp.abs(grid_coordinates(grid, positions) - vertices)
-    return jnp.maximum(0.0, 1.0 - distance).prod(-1)
+    hats = jnp.maximum(0.0, 1.0 - distance)
+    # Not `prod(-1)`: a reduction over three, which XLA for CPUs does one by one.
+    return hats[..., 0] * hats[..., 1] * hats[..., 2]
+
+
+def corner_weights(grid: DeformationGrid, cells: jax.Array, positions: jax.Array) -> jax.Array:
+    """Weight of the eight corners of each of some cells at each of some positions.
+
+    As `trilinear_weights`, whose hat functions of one axis are shared here by four corners.
+
+    Args:
+      grid: the grid.
+      cells: [I, 3] integer coordinates of each cell's lowest corner.
+      positions: [J, 3] scene units.
+
+    Returns:
+      [I, 8, J] in [0, 1]; 0 for corners that are not of the position's own cell.
+    """
+    u = grid_coordinates(grid, positions)
+
+    def hats(axis):
+        ends = cells[:, axis], cells[:, axis] + 1
+        return [jnp.maximum(0.0, 1.0 - jnp.abs(u[:, axis] - end[:, None])) for end in ends]
+
+    return jnp.stack([x * y * z for x in hats(0) for y in hats(1) for z in hats(2)], axis=1)
 
 
 def trilinear(grid: DeformationGrid, positions: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -18,10 +18,12 @@ import jax.numpy as jnp
 from bavs_jax.cameras import Rays
 from bavs_jax.fields.deformation import (
     DeformationGrid,
+    corner_weights,
     surrounding_vertices,
     trilinear_weights,
     vertex_number,
 )
+from bavs_jax.numerics import computed_once
 from bavs_jax.rendering.compositing import composite_colour, render_weights
 from bavs_jax.rendering.sampling import Samples, flatten_inputs
 
@@ -149,9 +151,9 @@ def vertex_squares(
       rows [S, 8] in the grid, and what to add there [S, 8, 3].
     """
     vertices = surrounding_vertices(grid, positions)  # [S, 8, 3]
-    b = trilinear_weights(grid, positions, vertices[:, :, None])  # [S, 8, S]: vertex of i, sample j
+    b = corner_weights(grid, vertices[:, 0], positions)  # [S, 8, S]: vertex of i, sample j
     vertex_jacobian = jnp.einsum("ikj,cjd->ikcd", b, jacobian)
-    own = jnp.diagonal(b, axis1=0, axis2=2).T  # [S, 8]
+    own = trilinear_weights(grid, positions[:, None], vertices)  # [S, 8]
     added = own[..., None] * jnp.einsum("cid,ikcd->ikd", jacobian, vertex_jacobian)
     return vertex_number(grid, vertices), added
 
@@ -190,6 +192,7 @@ def add_jac_sq_sum(
     residual = None if target is None else rgb - target
     jacobian = weight_jacobian(jacobian, residual, weighting)
     positions = rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]
+    positions = computed_once(positions)
     rows, added = jax.vmap(vertex_squares, in_axes=(None, 0, 0))(grid, positions, jacobian)
     if ray_weight is not None:
         added = added * ray_weight[:, None, None, None]
