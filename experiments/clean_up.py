@@ -33,8 +33,9 @@ NUM_PICTURES = 4
 
 FLAGS = flags.FLAGS
 flags.adopt_module_key_flags(script)
-flags.DEFINE_enum("rule", "keep", RULES, "How the threshold is chosen from the training views.")
-flags.DEFINE_float("keep", 0.99, "Share of the training views' content that must stay.")
+flags.DEFINE_enum("rule", RULES[0], RULES, "How the threshold is chosen from the training views.")
+flags.DEFINE_float("max_loss", 0.1, "Rule quality: dB that the training views may lose.")
+flags.DEFINE_float("keep", 0.99, "Rule keep: share of the training views' content that must stay.")
 flags.DEFINE_integer("num_thresholds", 20, "Thresholds of the sweep.")
 flags.DEFINE_float("min_opacity", MIN_OPACITY, "Opacity from which on a pixel is covered.")
 flags.DEFINE_integer("num_test", 50, "Test views, evenly spaced; 0: all.")
@@ -44,6 +45,7 @@ def clean_up() -> None:
     """Sweeps, chooses, measures and writes, run by run."""
     start = time.monotonic()
     script.check_flags(
+        ("max_loss", FLAGS.max_loss >= 0.0, "give 0 dB or more"),
         ("keep", 0.0 < FLAGS.keep <= 1.0, "give a share above 0 and up to 1"),
         ("num_thresholds", FLAGS.num_thresholds >= 3, "give 3 or more"),
         ("min_opacity", 0.0 < FLAGS.min_opacity <= 1.0, "give an opacity above 0 and up to 1"),
@@ -74,15 +76,15 @@ def clean_run(run: TrainedRun) -> dict:
         )
         for name, views in (("training", run.training_views), ("test", test_views))
     }
-    row = choose_threshold(sweeps["training"], rule=FLAGS.rule, keep=FLAGS.keep)
+    choice = {name: FLAGS[name].value for name in ("rule", "max_loss", "keep")}
+    row = choose_threshold(sweeps["training"], **choice)
     folder = run.folder / "cleanup"
     save_png(sweep_figure(sweeps["training"], sweeps["test"], row), folder / "sweep.png")
     pictures = spread_evenly(test_views, NUM_PICTURES)
     views = before_and_after(cleaned, run, pictures, thresholds[row])
     save_png(views_figure(views), folder / "views.png")
     print(f"pictures: {folder / 'sweep.png'}, {folder / 'views.png'}")
-    options = {name: FLAGS[name].value for name in ("rule", "keep", "min_opacity")}
-    options["num_test"] = len(test_views)
+    options = {**choice, "min_opacity": FLAGS.min_opacity, "num_test": len(test_views)}
     return {
         **script.about_run(run),
         "seconds": time.monotonic() - start,

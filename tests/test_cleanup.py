@@ -124,7 +124,7 @@ def chosen(render, variance):
     images = render(thresholds, rays)
     truth = images["rgb"][:, -1]
     sweep = sweep_of(thresholds, [pixel_sums(images, truth, background=BACKGROUND)])
-    return sweep, choose_threshold(sweep)
+    return sweep, choose_threshold(sweep, rule="keep")
 
 
 def test_floater_that_no_ray_saw_goes_and_wall_that_all_saw_stays(render, chosen):
@@ -284,18 +284,29 @@ def test_sweeps_that_cannot_be_used_are_errors():
 # --- the choice ---
 
 
-def sweep_with(content_kept) -> Sweep:
+def sweep_with(content_kept, psnr=None) -> Sweep:
     finite = np.linspace(0.1, 0.9, len(content_kept) - 1)
     blank = np.ones(len(content_kept))
-    return Sweep(np.append(finite, np.inf), np.asarray(content_kept), *[blank] * 6)
+    psnr = blank if psnr is None else np.asarray(psnr)
+    kept = np.asarray(content_kept)
+    return Sweep(np.append(finite, np.inf), kept, blank, psnr, *[blank] * 4)
+
+
+def test_quality_takes_the_lowest_threshold_from_which_on_training_views_lose_little():
+    sweep = sweep_with([0.0] * 6, psnr=[30.0, 29.95, 29.5, 29.95, 30.1, 30.0])
+    assert choose_threshold(sweep) == 3  # a row below is good again, but by luck
+    assert choose_threshold(sweep, max_loss=1.0) == 0
+    assert choose_threshold(sweep, max_loss=0.0) == 4
+    assert choose_threshold(sweep_with([0.0] * 4, psnr=[np.nan] * 4)) == 3  # nothing was measured
 
 
 def test_keep_takes_the_lowest_threshold_that_keeps_the_share():
+    choose = partial(choose_threshold, rule="keep")
     sweep = sweep_with([0.0, 0.5, 0.985, 0.992, 1.0, 1.0])
-    assert choose_threshold(sweep) == 3
-    assert choose_threshold(sweep, keep=0.98) == 2
-    assert choose_threshold(sweep, keep=1.0) == 4
-    assert choose_threshold(sweep_with([0.0, 0.2, 0.3, 1.0])) == 3  # nothing may go
+    assert choose(sweep) == 3
+    assert choose(sweep, keep=0.98) == 2
+    assert choose(sweep, keep=1.0) == 4
+    assert choose(sweep_with([0.0, 0.2, 0.3, 1.0])) == 3  # nothing may go
 
 
 def test_knee_is_where_the_curve_bends():
@@ -305,8 +316,10 @@ def test_knee_is_where_the_curve_bends():
 
 def test_rules_that_cannot_be_used_are_errors():
     sweep = sweep_with([0.0, 1.0, 1.0])
-    with pytest.raises(ValueError, match="use one of keep, knee"):
+    with pytest.raises(ValueError, match="use one of quality, keep, knee"):
         choose_threshold(sweep, rule="elbow")
+    with pytest.raises(ValueError, match="0 dB or more"):
+        choose_threshold(sweep, max_loss=-0.1)
     with pytest.raises(ValueError, match="above 0 and up to 1"):
         choose_threshold(sweep, keep=0.0)
     with pytest.raises(ValueError, match="3 or more"):

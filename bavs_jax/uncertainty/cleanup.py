@@ -23,7 +23,7 @@ from bavs_jax.rendering.pixels import render_pixels
 from bavs_jax.rendering.samplers import Sampler
 from bavs_jax.uncertainty.channel import finish_uncertainty, make_uncertainty_channel
 
-RULES = ("keep", "knee")
+RULES = ("quality", "keep", "knee")
 
 
 def make_point_uncertainty_fn(
@@ -155,15 +155,20 @@ def spread_thresholds(variance, num: int) -> np.ndarray:
     return np.append(np.linspace(low, high, num), np.inf).astype(np.float32)
 
 
-def choose_threshold(sweep: Sweep, *, rule: str = "keep", keep: float = 0.99) -> int:
+def choose_threshold(
+    sweep: Sweep, *, rule: str = "quality", max_loss: float = 0.1, keep: float = 0.99
+) -> int:
     """Which threshold to clean up with, from renders of the *training* views alone.
 
-    What the photos show must stay, and what no photo relies on may go. "What the photos show" is
-    the content of the training rays: each sample of the untouched field counts by its rendering
-    weight (`Sweep.content_kept`). A field shows no view that was left out, so no test view enters.
+    What the photos show must stay, and what no photo relies on may go. A field shows no view that
+    was left out, so no test view enters.
 
-    `keep`: the lowest threshold that keeps at least the share `keep` of the training content; on a
-    fine sweep this is the `keep` quantile of the uncertainty of what the photos show.
+    `quality`: the lowest threshold from which on no threshold costs the training views more than
+    `max_loss` of their PSNR.
+    `keep`: the lowest threshold that keeps at least the share `keep` of the training content, each
+    sample of the untouched field counting by its rendering weight (`Sweep.content_kept`); on a fine
+    sweep this is the `keep` quantile of the uncertainty of what training rays meet. Fog in the
+    colour of the background is content too, is uncertain everywhere, and drives this threshold up.
     `knee`: where the curve of kept content over finite thresholds lies highest above the straight
     line between its ends (Satopaa et al. 2011): from there on a lower threshold costs more content
     for each step than it did on the average.
@@ -171,26 +176,36 @@ def choose_threshold(sweep: Sweep, *, rule: str = "keep", keep: float = 0.99) ->
     Args:
       sweep: of the training views.
       rule: one of `RULES`.
+      max_loss: dB, >= 0; read by the rule `quality` alone.
       keep: share of the content, in (0, 1]; read by the rule `keep` alone.
 
     Returns:
-      Row of `sweep`, the last (`+inf`, no clean-up) if no other keeps enough.
+      Row of `sweep`, the last (`+inf`, no clean-up) if no other is good enough.
 
     Raises:
-      ValueError: unknown rule, a share outside of (0, 1], or fewer than 3 finite thresholds for
-        the rule `knee`.
+      ValueError: unknown rule, a loss below 0, a share outside of (0, 1], or fewer than 3 finite
+        thresholds for the rule `knee`.
     """
     if rule not in RULES:
         raise ValueError(f"rule: {rule!r} is unknown; use one of {', '.join(RULES)}")
-    kept = np.asarray(sweep.content_kept)
+    if not max_loss >= 0.0:
+        raise ValueError(f"max_loss: {max_loss} is no loss; give 0 dB or more")
+    if not 0.0 < keep <= 1.0:
+        raise ValueError(f"keep: {keep} is no share; give a number above 0 and up to 1")
+    if rule == "knee":
+        return _knee(np.asarray(sweep.thresholds)[:-1], np.asarray(sweep.content_kept)[:-1])
     if rule == "keep":
-        if not 0.0 < keep <= 1.0:
-            raise ValueError(f"keep: {keep} is no share; give a number above 0 and up to 1")
-        return int(np.argmax(kept >= keep)) if kept[-1] >= keep else len(kept) - 1
-    finite, kept = np.asarray(sweep.thresholds)[:-1], kept[:-1]
-    if len(finite) < 3:
-        raise ValueError(f"thresholds: {len(finite)} are too few for a knee; give 3 or more")
-    chord = np.interp(finite, finite[[0, -1]], kept[[0, -1]])
+        good = np.asarray(sweep.content_kept) >= keep
+    else:
+        good = np.asarray(sweep.psnr) >= sweep.psnr[-1] - max_loss
+    good[-1] = True  # nothing removed: also where there was nothing to measure
+    return int(len(good) - np.argmin(good[::-1])) if not good.all() else 0
+
+
+def _knee(thresholds: np.ndarray, kept: np.ndarray) -> int:
+    if len(thresholds) < 3:
+        raise ValueError(f"thresholds: {len(thresholds)} are too few for a knee; give 3 or more")
+    chord = np.interp(thresholds, thresholds[[0, -1]], kept[[0, -1]])
     return int(np.argmax(kept - chord))
 
 
