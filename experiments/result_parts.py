@@ -35,7 +35,14 @@ def run_parts(path: pathlib.Path) -> list[Part]:
         run_tables.timing_table,
     )
     tables = [table for make in makers if (table := make(runs, policies)) is not None]
-    return [made_by(runs[0].result), *tables]
+    commands = list(dict.fromkeys(run.result["command"] for run in runs))
+    return [made_by(runs[0].result | {"command": common_command(commands)}), *tables]
+
+
+def common_command(commands: list[str]) -> str:
+    """What all commands share: runs that were made in parts are those of one command."""
+    words = [command.split() for command in commands]
+    return " ".join(word for word in words[0] if all(word in others for others in words))
 
 
 def uncertainty_parts(path: pathlib.Path) -> list[Part]:
