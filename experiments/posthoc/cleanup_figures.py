@@ -19,7 +19,7 @@ def sweep_figure(train: Sweep, test: Sweep, row: int) -> Figure:
       train, test: over the same thresholds.
       row: of the chosen one.
     """
-    figure = Figure(figsize=(6.4, 6.2), layout="constrained")
+    figure = Figure(figsize=(8.6, 5.8), layout="constrained")
     quality, share = figure.subplots(2, 1, sharex=True)
     finite = test.thresholds[:-1]
     for values, colour, style, label in (
@@ -28,15 +28,8 @@ def sweep_figure(train: Sweep, test: Sweep, row: int) -> Figure:
         (test.psnr, GREEN, ":", "cleaned, all pixels"),
     ):
         _curve(quality, finite, values[:-1], colour, style, label)
-    quality.axhline(test.psnr_covered[-1], color=GREY, linewidth=0.9, linestyle="-.", zorder=1)
-    quality.annotate(
-        "untouched, all that it covers",
-        xy=(finite[0], test.psnr_covered[-1]),
-        xytext=(0, 3),
-        textcoords="offset points",
-        fontsize=8,
-        color=GREY,
-    )
+    everything = {"color": GREY, "linewidth": 0.9, "linestyle": "-.", "zorder": 1}
+    quality.axhline(test.psnr_covered[-1], label="untouched, all that it covers", **everything)
     quality.set_title("PSNR of test views (dB, pixels pooled)", fontsize=10.5, loc="left")
     for values, colour, style, label in (
         (test.share_covered, BLUE, "-", "covered, of the pixels with matter (test)"),
@@ -55,7 +48,7 @@ def sweep_figure(train: Sweep, test: Sweep, row: int) -> Figure:
             axes.axvline(chosen, color=GREY, linewidth=1.2, zorder=1, label="chosen threshold")
         axes.grid(axis="y", color="#e5e7eb", linewidth=0.8)
         tidy(axes)
-        axes.legend(fontsize=8, frameon=False, loc="best")
+        axes.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
