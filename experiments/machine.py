@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import platform
 import resource
 import sys
 
 import jax
+
+PACKAGES = ("bavs_jax", "jax", "jaxlib", "flax", "optax", "numpy")
 
 
 def device_name() -> str:
@@ -27,3 +30,15 @@ def peak_memory_mb() -> float:
     """Most memory of the host that this process has held so far, in units of 10^6 bytes."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+
+
+def peak_device_memory_mb() -> float | None:
+    """Most memory of the device held so far, in units of 10^6 bytes; None where it is the host's."""
+    stats = jax.devices()[0].memory_stats()
+    return None if stats is None else stats["peak_bytes_in_use"] / 1e6
+
+
+def versions() -> dict[str, str]:
+    """Of Python and of the packages that results depend on."""
+    packages = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return packages | {"python": platform.python_version()}

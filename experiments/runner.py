@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import json
 import pathlib
-import platform
 import time
 from functools import partial
 
@@ -23,12 +21,11 @@ from experiments.build import Problem, run_key
 from experiments.build_scene import initial_views
 from experiments.evaluate import evaluate_views, picture_arrays, spread_evenly
 from experiments.files import append_line, write_arrays, write_json
-from experiments.machine import device_name, peak_memory_mb
+from experiments.machine import device_name, peak_memory_mb, versions
 from experiments.progress import track
 from experiments.report.choices import bound_words
 
 SCHEMA_VERSION = 1
-PACKAGES = ("bavs_jax", "jax", "jaxlib", "flax", "optax", "numpy")
 LOG_EVERY = 10  # training calls between two lines of metrics.jsonl
 
 
@@ -234,8 +231,7 @@ class Run:
             "seed": self.seed,
             "command": self.command,
             "config": self.config.to_dict(),
-            "versions": {p: importlib.metadata.version(p) for p in PACKAGES}
-            | {"python": platform.python_version()},
+            "versions": versions(),
             "device": device_name(),
             "peak_memory_mb": peak_memory_mb(),
             "completed": completed,

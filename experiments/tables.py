@@ -4,8 +4,8 @@
     python -m experiments.tables --page=README.md
 
 The first prints the tables of one experiment. The second writes every table of a page anew: each
-stands between `<!-- results: FOLDER -->` and `<!-- end of results -->`, where FOLDER holds a
-`summary.json` and is relative to the page.
+stands between `<!-- results: FOLDER -->` and `<!-- end of results -->`, where FOLDER is relative to
+the page and holds a `summary.json`, or what a benchmark wrote.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ import sys
 from absl import flags
 
 from experiments import runtime
+from experiments.bench.results import bench_tables
 from experiments.files import write_atomic
 from experiments.report import ReportError
 from experiments.report.results import load_runs
 from experiments.report.tables import (
-    Table,
     baseline_table,
     final_table,
+    markdown,
     rounds_table,
     timing_table,
 )
@@ -35,17 +36,10 @@ flags.DEFINE_string("page", None, "Markdown file whose tables are written anew."
 MARKED = re.compile(r"(<!-- results: (\S+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 
 
-def markdown(table: Table) -> str:
-    """A table as Markdown, with the reasons for its dashes below."""
-    rows = [table.head, ["---"] * len(table.head)]
-    rows += [[cell.text for cell in row] for row in table.rows]
-    lines = ["| " + " | ".join(row) + " |" for row in rows]
-    reasons = [f"\n— {'; '.join(table.reasons)}."] if table.reasons else []
-    return "\n".join([*lines, *reasons])
-
-
 def result_tables(folder: pathlib.Path) -> str:
-    """Quality at the last shared number of views, and where the time went."""
+    """Quality at the last shared number of views, and where the time went; or a benchmark's."""
+    if (measured := bench_tables(folder)) is not None:
+        return measured
     runs = load_runs(folder)
     policies = list(dict.fromkeys(run.policy for run in runs))
     command = runs[0].result["command"]

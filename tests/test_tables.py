@@ -2,8 +2,8 @@
 
 import pathlib
 
-from experiments.report.tables import Cell, Table
-from experiments.tables import MARKED, fill_page, markdown
+from experiments.report.tables import Cell, Table, markdown
+from experiments.tables import MARKED, fill_page
 
 ROOT = pathlib.Path(__file__).parents[1]
 
