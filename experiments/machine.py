@@ -33,7 +33,7 @@ def peak_memory_mb() -> float:
 
 
 def peak_device_memory_mb() -> float | None:
-    """Most memory of the device held so far, in units of 10^6 bytes; None where it is the host's."""
+    """Likewise of the device's own memory; None where the device is the host."""
     stats = jax.devices()[0].memory_stats()
     return None if stats is None else stats["peak_bytes_in_use"] / 1e6
 

@@ -68,7 +68,7 @@ def make_count_fn(subject: Subject):
 def rendering_work(
     subject: Subject, state: TrainState, rays: Rays, num_samples: int, variance=None
 ) -> Work:
-    """Of one chunk of rays with so many samples in all, with uncertainty where there is variance."""
+    """Of one chunk of rays with so many samples in all; with a variance, of its uncertainty too."""
     toolbox = subject.toolbox
     field, sampler = toolbox.fields[toolbox.kind]
     options = toolbox.laplace
