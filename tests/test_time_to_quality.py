@@ -25,11 +25,11 @@ def test_a_target_is_reached_where_it_is_first_seen():
 
 def test_script_measures_with_a_cold_and_a_warm_cache(tmp_path):
     command = [sys.executable, "-m", "experiments.time_to_quality", f"--workdir={tmp_path}"]
-    command += [*toy_flags(train__num_steps=16, march__num_slots=8)]
+    command += [*toy_flags(train__num_steps=16, train__steps_per_call=8, march__num_slots=8)]
     command += ["--num_views=3", "--num_test_views=2", "--every=8", "--targets=99,5"]
     quick = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "XDG_CACHE_HOME": str(tmp_path)}
     done = subprocess.run(
-        command, cwd=ROOT, env=os.environ | quick, capture_output=True, text=True, timeout=300
+        command, cwd=ROOT, env=os.environ | quick, capture_output=True, text=True, timeout=900
     )
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "time_to_quality.json").read_text())
@@ -53,6 +53,6 @@ def test_script_measures_with_a_cold_and_a_warm_cache(tmp_path):
 def test_targets_that_are_no_numbers_end_in_one_line(tmp_path):
     command = [sys.executable, "-m", "experiments.time_to_quality", f"--workdir={tmp_path}"]
     done = subprocess.run(
-        [*command, "--targets=high"], cwd=ROOT, capture_output=True, text=True, timeout=100
+        [*command, "--targets=high"], cwd=ROOT, capture_output=True, text=True, timeout=300
     )
     assert done.returncode != 0 and "--targets" in done.stderr and "Traceback" not in done.stderr

@@ -22,12 +22,12 @@ def default_sizes() -> ConfigDict:
     sizes.growth = ConfigDict()
     sizes.growth.repeats = 3
     sizes.growth.train_calls = 2
-    sizes.growth.train_rays = (256, 512, 1024, 2048, 4096)  # of one step
-    sizes.growth.render_rays = (4096, 8192, 16384, 32768, 65536, 131072)
-    sizes.growth.curvature_rays = (4096, 8192, 16384, 32768, 65536)
+    sizes.growth.train_rays = (512, 1024, 2048, 4096)  # of one step
+    sizes.growth.render_rays = (4096, 16384, 65536, 131072)
+    sizes.growth.curvature_rays = (4096, 16384, 32768, 65536)
     sizes.growth.grid_log2 = (5, 6, 7, 8)  # L: grids of 2^L cells per side
     sizes.growth.grid_rays = 16384  # whose curvature each grid gets
-    sizes.growth.candidates = (25, 50, 100, 250, 500, 1000)
+    sizes.growth.candidates = (25, 100, 250, 1000)
     sizes.growth.candidate_pixels = 25
     sizes.growth.batch_size = (1, 4, 16, 64)
     return sizes
