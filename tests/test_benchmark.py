@@ -13,7 +13,7 @@ from experiments.bench.clock import timed
 from experiments.bench.counts import Work, compiled_work
 from experiments.bench.fits import fit_growth
 from experiments.bench.measure import benchmark
-from experiments.bench.results import STAGES, amount, bench_tables
+from experiments.bench.results import STAGES, amount, bench_tables, duration
 from experiments.bench.settings import default_sizes
 from experiments.bench.work import slot_width
 from tests.toy_runs import toy_config
@@ -125,6 +125,13 @@ def test_what_is_not_linear_is_off_the_line():
 )
 def test_amounts_have_three_digits_and_a_prefix(value, text):
     assert amount(value) == text
+
+
+@pytest.mark.parametrize(
+    "seconds, text", [(2e-4, "0.2 ms"), (0.9994, "999 ms"), (0.9999, "1.00 s"), (75.0, "75.0 s")]
+)
+def test_durations_change_to_milliseconds_below_one_second(seconds, text):
+    assert duration(seconds) == text
 
 
 # --- end to end ------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 
 from experiments.bench.results import STAGES, amount
 from experiments.report import plots
@@ -32,7 +32,7 @@ def growth_plot(name: str, row: dict) -> str:
             linewidth=1.0,
             label="in proportion",
         )
-        title = f"{row['title']}: time ~ ({row['size']})^{fit['exponent']:.2f}"
+        title = f"{row['title']}\ntime ~ n^{fit['exponent']:.2f}"
     else:
         title = row["title"]
     axes.plot(
@@ -50,13 +50,14 @@ def growth_plot(name: str, row: dict) -> str:
     axes.set_ylim(min(seconds.min() / 2, seconds.max() / 8), seconds.max() * 2)
     axes.set_xticks(sizes, [f"{size:,}" for size in sizes], rotation=30, ha="right")
     axes.xaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{1e3 * value:g} ms"))
-    axes.set_xlabel(row["size"], fontsize=9.5, color="#374151")
+    axes.set_xlabel(f"n: {row['size']}", fontsize=9.5, color="#374151")
     axes.set_title(title, fontsize=10, loc="left")
     axes.grid(axis="y", color="#e5e7eb", linewidth=0.8)
     plots.tidy(axes)
     axes.legend(frameon=False, fontsize=8)
-    return plots.to_svg(figure, salt=f"growth-{name}", label=title)
+    return plots.to_svg(figure, salt=f"growth-{name}", label=f"Time of {row['title']}")
 
 
 def ceiling_plot(result: dict) -> str:

@@ -26,6 +26,11 @@ def amount(value: float) -> str:
     return f"{value:.3g} "
 
 
+def duration(value: float) -> str:
+    """Seconds in words, milliseconds below one."""
+    return f"{1e3 * value:.3g} ms" if value < 0.9995 else seconds(value)
+
+
 def stage_table(result: dict) -> Table:
     """Rates, compile times, and the shares of both ceilings."""
     head = ("stage", "a second", "one run", "compiling", "operations a second")
@@ -35,9 +40,9 @@ def stage_table(result: dict) -> Table:
         row = result["stages"][name]
         unit = row["unit"]
         cells = (
-            *(title, f"{amount(row[f'{unit}_per_s'])}{unit}"),
-            f"{row[f'{unit}_per_run']:,.0f} {unit} in {1e3 * row['median_run_s']:.3g} ms",
-            seconds(row["compile_s"]),
+            *(title, f"{row[f'{unit}_per_s']:,.0f} {unit}"),
+            f"{row[f'{unit}_per_run']:,.0f} in {duration(row['median_run_s'])}",
+            duration(row["compile_s"]),
             *(f"{amount(row['flops_per_s'])}FLOP", f"{row['share_of_matmul_ceiling']:.1%}"),
             *(f"{amount(row['bytes_per_s'])}B", f"{row['share_of_copy_ceiling']:.1%}"),
         )
@@ -52,7 +57,7 @@ def growth_table(result: dict) -> Table | None:
     head = ("what", "grows with", "from", "to", "time", "exponent", "off a straight line by")
     rows = []
     for row in result["growth"].values():
-        first, last = (f"{1e3 * row['median_s'][i]:.3g} ms" for i in (0, -1))
+        first, last = (duration(row["median_s"][i]) for i in (0, -1))
         cells = [row["title"], row["size"], f"{row['sizes'][0]:,}", f"{row['sizes'][-1]:,}"]
         fit = row["fit"]
         known = [Cell(text) for text in (*cells, f"{first} to {last}")]
@@ -84,7 +89,7 @@ def facts(result: dict) -> list[str]:
     if result["peak_device_memory_mb"] is not None:
         memory += f", {result['peak_device_memory_mb']:,.0f} MB of the device"
     return [
-        f"Training evaluates {amount(result['train_samples_per_s'])}samples a second.",
+        f"Training evaluates {result['train_samples_per_s']:,.0f} samples a second.",
         f"Ceilings: {amount(ceilings['matmul_flops_per_s'])}FLOP/s in a float32 matrix product, "
         f"{amount(ceilings['copy_bytes_per_s'])}B/s in a copy.",
         f"{memory}.",
