@@ -24,7 +24,7 @@ from ml_collections import config_flags
 
 from experiments import runtime
 from experiments.bench.page import quality_sections, write_page
-from experiments.bench.quality import first_seconds, measure_run
+from experiments.bench.quality import first_seconds, measure_run, parse_targets
 from experiments.bench.results import QUALITY, bench_tables
 from experiments.build_scene import load_config_scene
 from experiments.configs import base
@@ -123,10 +123,7 @@ def main() -> None:
     config, folder = FLAGS.config, pathlib.Path(FLAGS.workdir)
     config.lpips_net = ""
     try:
-        targets = sorted(FLAGS.targets, key=float)
-    except ValueError:
-        sys.exit(f"error: --targets: {FLAGS.targets} are not all numbers; give some such as 25,28")
-    try:
+        targets = parse_targets(FLAGS.targets)
         if FLAGS.part is None:
             compare_caches(config, folder, runtime.command_line())
         else:

@@ -7,9 +7,11 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
-from experiments.bench.quality import first_seconds
+from experiments.bench.quality import first_seconds, parse_targets
 from experiments.bench.results import bench_tables
+from experiments.errors import ConfigError
 from tests.toy_runs import toy_flags
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -50,9 +52,7 @@ def test_script_measures_with_a_cold_and_a_warm_cache(tmp_path):
     assert (tmp_path / "time_to_quality.html").read_text().count("<svg") == 1
 
 
-def test_targets_that_are_no_numbers_end_in_one_line(tmp_path):
-    command = [sys.executable, "-m", "experiments.time_to_quality", f"--workdir={tmp_path}"]
-    done = subprocess.run(
-        [*command, "--targets=high"], cwd=ROOT, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode != 0 and "--targets" in done.stderr and "Traceback" not in done.stderr
+def test_targets_are_sorted_as_numbers_and_others_refused():
+    assert parse_targets(["28", "9.5", "25"]) == ["9.5", "25", "28"]
+    with pytest.raises(ConfigError, match="--targets"):
+        parse_targets(["25", "high"])

@@ -12,9 +12,22 @@ from experiments import runtime
 from experiments.bench.subject import SEED
 from experiments.build import build_problem, run_key
 from experiments.build_scene import initial_views, load_config_scene
+from experiments.errors import ConfigError
 from experiments.evaluate import evaluate_views, spread_evenly
 from experiments.machine import device_name
 from experiments.progress import track
+
+
+def parse_targets(texts: list[str]) -> list[str]:
+    """PSNRs in dB as they were given, the smallest first.
+
+    Raises:
+      ConfigError: one of them is not a number.
+    """
+    try:
+        return sorted(texts, key=float)
+    except ValueError:
+        raise ConfigError(f"--targets: {texts} are not all numbers; give some like 25,28") from None
 
 
 def measure_run(

@@ -153,7 +153,7 @@ def make_rendering_run(subject: Subject, state: TrainState, num_rays: int) -> Ca
 def measure_rendering(subject: Subject, state: TrainState, sizes) -> Stage:
     """Colour and depth of training pixels."""
     rays = _training_rays(subject, RENDER_CHUNK)
-    num_samples = max(int(work.make_count_fn(subject)(state, rays).sum()), 1)
+    num_samples = max(int(subject.count_samples(state, rays).sum()), 1)
     chunk = work.rendering_work(subject, state, rays, num_samples)
     run = make_rendering_run(subject, state, sizes.render_rays)
     return _measure(
@@ -174,7 +174,7 @@ def make_curvature_run(subject: Subject, state: TrainState, num_rays: int) -> Ca
 def measure_curvature(subject: Subject, state: TrainState, sizes) -> Stage:
     """The raw Jacobian sum of training pixels."""
     rays = _training_rays(subject, sizes.curvature_rays)
-    counts = np.asarray(work.make_count_fn(subject)(state, rays))
+    counts = np.asarray(subject.count_samples(state, rays))
     run = make_curvature_run(subject, state, sizes.curvature_rays)
     return _measure(
         *("curvature", "rays", sizes.curvature_rays, run, sizes.repeats),
@@ -207,7 +207,7 @@ def measure_scoring(subject: Subject, state: TrainState, jac_sq_sum, sizes) -> S
     view_ids = rng.integers(0, len(cameras), RENDER_CHUNK)
     within = rng.integers(0, num_pixels(cameras)[view_ids])
     rays = jax.jit(view_pixel_rays)(jax.tree.map(np.asarray, cameras), view_ids, within)
-    num_samples = max(int(work.make_count_fn(subject)(state, rays).sum()), 1)
+    num_samples = max(int(subject.count_samples(state, rays).sum()), 1)
     variance = vertex_variance(
         jac_sq_sum,
         num_rays=num_rays,

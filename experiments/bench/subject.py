@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -30,6 +31,7 @@ class Subject(NamedTuple):
     toolbox: Toolbox
     trainer: Trainer
     is_training_view: np.ndarray  # [V] bool
+    count_samples: Callable  # (TrainState, rays [R]) -> samples of each ray [R]
 
     @property
     def scene(self) -> Scene:
@@ -55,7 +57,15 @@ def make_subject(config, scene: Scene, num_views: int) -> Subject:
     is_training = np.zeros(len(problem.table.cameras), bool)
     is_training[initial_views(scene, SEED, num_views)] = True
     trainer = build_trainer(config, scene, len(is_training), RECONSTRUCTION)
-    return Subject(config, problem, problem.make_toolbox(track), trainer, is_training)
+    sampler = trainer.sampler
+
+    @jax.jit
+    def count_samples(state, rays):
+        samples, _ = sampler.sample(None, state.params["sampler"], state.sampler_state, rays)
+        return samples.sample_mask.sum(-1)
+
+    toolbox = problem.make_toolbox(track)
+    return Subject(config, problem, toolbox, trainer, is_training, count_samples)
 
 
 def train_field(subject: Subject) -> TrainState:

@@ -53,18 +53,6 @@ def training_work(subject: Subject, state: TrainState) -> Work:
     return (call - update_work) * config.train.steps_per_call + update_work
 
 
-def make_count_fn(subject: Subject):
-    """Makes the jitted `count(state, rays [R]) -> samples [R]`."""
-    _, sampler = subject.toolbox.fields[subject.toolbox.kind]
-
-    @jax.jit
-    def count(state, rays):
-        samples, _ = sampler.sample(None, state.params["sampler"], state.sampler_state, rays)
-        return samples.sample_mask.sum(-1)
-
-    return count
-
-
 def rendering_work(
     subject: Subject, state: TrainState, rays: Rays, num_samples: int, variance=None
 ) -> Work:
@@ -104,7 +92,7 @@ def curvature_work(subject: Subject, state: TrainState, rays: Rays, counts: np.n
     toolbox = subject.toolbox
     field, sampler = toolbox.fields[toolbox.kind]
     grid, weighting = toolbox.grid, toolbox.laplace.weighting
-    finding = compiled_work(make_count_fn(subject), state, rays)
+    finding = compiled_work(subject.count_samples, state, rays)
     if not counts.any():
         return finding
     width = slot_width(float(counts[counts > 0].mean()), sampler.num_slots)
