@@ -53,3 +53,9 @@ def peak_memory_mb() -> float:
     """Most memory of the host that this process has held so far, in units of 10^6 bytes."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+
+
+def peak_device_memory_mb() -> float | None:
+    """Likewise of the device's own memory; None where the device is the host."""
+    stats = jax.devices()[0].memory_stats()
+    return None if stats is None else stats["peak_bytes_in_use"] / 1e6

@@ -6,6 +6,7 @@ import json
 import pathlib
 from functools import partial
 
+from experiments.bench import results as bench
 from experiments.posthoc.tables import TABLES as POSTHOC_TABLES
 from experiments.predicted.results import RESULT_FILE as GAIN_FILE
 from experiments.predicted.results import correlation_table, stop_table
@@ -79,19 +80,21 @@ PARTS = {
     "summary.json": run_parts,
     uncertain.NAME: uncertainty_parts,
     GAIN_FILE: gain_parts,
+    bench.BENCHMARK: bench.benchmark_parts,
+    bench.QUALITY: bench.quality_parts,
     **{name: partial(posthoc_parts, make) for name, make in POSTHOC_TABLES.items()},
 }
 
 
 def result_parts(folder: pathlib.Path) -> list[Part]:
-    """Words and tables about the experiment whose result file a folder holds.
+    """Words and tables about the result files that a folder holds.
 
     Raises:
       ReportError: it holds none, or one that cannot be used.
     """
-    for name, make_parts in PARTS.items():
-        if (folder / name).exists():
-            return make_parts(folder / name)
+    found = [make(folder / name) for name, make in PARTS.items() if (folder / name).exists()]
+    if found:
+        return [part for parts in found for part in parts]
     raise ReportError(
         f"{folder}: holds none of {', '.join(PARTS)}; give the --workdir of an experiment"
     )

@@ -19,7 +19,7 @@ from absl import flags
 from experiments import runtime
 from experiments.files import write_atomic
 from experiments.report import ReportError
-from experiments.report.tables import Table
+from experiments.report.tables import markdown_parts
 from experiments.result_parts import result_parts
 
 FLAGS = flags.FLAGS
@@ -29,19 +29,9 @@ flags.DEFINE_string("page", None, "Markdown file whose tables are written anew."
 MARKED = re.compile(r"(<!-- results: (\S+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 
 
-def markdown(table: Table) -> str:
-    """A table as Markdown, with the reasons for its dashes below."""
-    rows = [table.head, ["---"] * len(table.head)]
-    rows += [[cell.text for cell in row] for row in table.rows]
-    lines = ["| " + " | ".join(row) + " |" for row in rows]
-    reasons = [f"\n— {'; '.join(table.reasons)}."] if table.reasons else []
-    return "\n".join([*lines, *reasons])
-
-
 def result_tables(folder: pathlib.Path) -> str:
     """Words and tables about the experiment in a folder, as Markdown; see `result_parts`."""
-    parts = result_parts(folder)
-    return "\n\n".join(part if isinstance(part, str) else markdown(part) for part in parts) + "\n"
+    return markdown_parts(result_parts(folder))
 
 
 def fill_page(text: str, root: pathlib.Path) -> str:

@@ -4,8 +4,8 @@ import json
 import pathlib
 
 from experiments.posthoc.tables import cleanup_table, draws_table, geometry_table
-from experiments.report.tables import Cell, Table
-from experiments.tables import MARKED, fill_page, markdown
+from experiments.report.tables import Cell, Table, markdown
+from experiments.tables import MARKED, fill_page
 
 ROOT = pathlib.Path(__file__).parents[1]
 

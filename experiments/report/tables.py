@@ -31,6 +31,20 @@ class Table:
         return tuple(dict.fromkeys(whys))
 
 
+def markdown(table: Table) -> str:
+    """A table as Markdown, with the reasons for its dashes below."""
+    rows = [table.head, ["---"] * len(table.head)]
+    rows += [[cell.text for cell in row] for row in table.rows]
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    reasons = [f"\n— {'; '.join(table.reasons)}."] if table.reasons else []
+    return "\n".join([*lines, *reasons])
+
+
+def markdown_parts(parts: list[str | Table]) -> str:
+    """Words and tables one after another as Markdown."""
+    return "\n\n".join(p if isinstance(p, str) else markdown(p) for p in parts) + "\n"
+
+
 def dash(why: str) -> Cell:
     return Cell("—", why)
 

@@ -1,0 +1,1 @@
+"""How fast everything is: the parts of `python -m experiments.benchmark`."""

@@ -1,0 +1,125 @@
+"""Figures of the benchmark as inline SVG."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
+
+from experiments.bench.results import STAGES, amount
+from experiments.report import plots
+
+
+def growth_plot(name: str, row: dict) -> str:
+    """Seconds against size, both on log scales, with the straight line; linear has a slope of 1."""
+    sizes, seconds = np.array(row["sizes"]), np.array(row["median_s"])
+    figure = Figure(figsize=(4.6, 3.4), layout="constrained")
+    axes = figure.add_subplot()
+    if row["fit"] is not None:
+        fit = row["fit"]
+        steps = np.geomspace(sizes[0], sizes[-1], 100)
+        line = fit["intercept_s"] + fit["slope_s"] * steps
+        axes.plot(
+            *(steps[line > 0], line[line > 0]),
+            color=plots.GREY,
+            linewidth=1.2,
+            linestyle="--",
+            label=f"straight line, off by at most {fit['largest_deviation']:.0%}",
+        )
+        axes.plot(
+            *(steps, seconds[-1] * steps / sizes[-1]),
+            color=plots.PALE,
+            linewidth=1.0,
+            label="in proportion",
+        )
+        title = f"{row['title']}\ntime ~ n^{fit['exponent']:.2f}"
+    else:
+        title = row["title"]
+    axes.plot(
+        *(sizes, seconds),
+        color=plots.BLUE,
+        linestyle="none",
+        marker="o",
+        markersize=6,
+        markeredgecolor="white",
+        label="measured",
+    )
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    # Room above and below, so that a time which does not grow looks like one.
+    axes.set_ylim(min(seconds.min() / 2, seconds.max() / 8), seconds.max() * 2)
+    axes.set_xticks(sizes, [f"{size:,}" for size in sizes], rotation=30, ha="right")
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{1e3 * value:g} ms"))
+    axes.set_xlabel(f"n: {row['size']}", fontsize=9.5, color="#374151")
+    axes.set_title(title, fontsize=10, loc="left")
+    axes.grid(axis="y", color="#e5e7eb", linewidth=0.8)
+    plots.tidy(axes)
+    axes.legend(frameon=False, fontsize=8)
+    return plots.to_svg(figure, salt=f"growth-{name}", label=f"Time of {row['title']}")
+
+
+def ceiling_plot(result: dict) -> str:
+    """Each stage's arithmetic per byte and per second, under both ceilings (a roofline)."""
+    ceilings, stages = result["ceilings"], result["stages"]
+    style = plots.policy_style(list(STAGES))
+    figure = Figure(figsize=(6.2, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    top, slope = ceilings["matmul_flops_per_s"], ceilings["copy_bytes_per_s"]
+    intensity = {n: s["flops_per_run"] / s["bytes_per_run"] for n, s in stages.items()}
+    ends = [*intensity.values(), top / slope]
+    steps = np.geomspace(min(ends) / 3, max(ends) * 3, 100)
+    axes.plot(
+        *(steps, np.minimum(top, slope * steps)),
+        color=plots.GREY,
+        linewidth=1.5,
+        label="copy, then matrix product",
+    )
+    for name, title in STAGES.items():
+        colour, marker = style[name]
+        axes.plot(
+            *([intensity[name]], [stages[name]["flops_per_s"]]),
+            color=colour,
+            marker=marker,
+            markersize=8,
+            linestyle="none",
+            label=title,
+        )
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{amount(value)}FLOP/s"))
+    axes.set_xlabel("operations for each byte", fontsize=10, color="#374151")
+    axes.set_title("Stages under the ceilings of this machine", fontsize=10.5, loc="left")
+    axes.grid(color="#e5e7eb", linewidth=0.8)
+    plots.tidy(axes)
+    axes.legend(frameon=False, fontsize=8.5)
+    return plots.to_svg(figure, salt="ceilings", label="Stages under the ceilings of this machine")
+
+
+def quality_plot(result: dict) -> str:
+    """PSNR on test views against seconds since the process was started."""
+    runs = result["runs"]
+    style = plots.policy_style(list(runs))
+    figure = Figure(figsize=(6.2, 4.2), layout="constrained")
+    axes = figure.add_subplot()
+    for target in next(iter(runs.values()))["seconds_to_db"]:
+        axes.axhline(float(target), color=plots.PALE, linewidth=1.0)
+    for cache, run in runs.items():
+        colour, marker = style[cache]
+        axes.plot(
+            [point["seconds"] for point in run["curve"]],
+            [point["psnr"] for point in run["curve"]],
+            color=colour,
+            marker=marker,
+            markersize=4.5,
+            markeredgecolor="white",
+            label=f"{cache} compilation cache",
+        )
+    axes.set_xlim(0.0, None)
+    axes.set_xlabel("seconds since the start, without measuring", fontsize=10, color="#374151")
+    axes.set_title("PSNR on test views (dB)", fontsize=10.5, loc="left")
+    axes.grid(axis="y", color="#e5e7eb", linewidth=0.8)
+    plots.tidy(axes)
+    axes.legend(frameon=False, fontsize=9)
+    return plots.to_svg(figure, salt="quality", label="PSNR against seconds")

@@ -1,0 +1,90 @@
+"""How good a field is after how many seconds."""
+
+from __future__ import annotations
+
+import time
+
+import jax
+import numpy as np
+
+from bavs_jax.active import init_active_state
+from experiments import runtime
+from experiments.bench.subject import SEED
+from experiments.build import build_problem, run_key
+from experiments.build_scene import initial_views, load_config_scene
+from experiments.errors import ConfigError
+from experiments.evaluate import evaluate_views, spread_evenly
+from experiments.machine import device_name
+from experiments.progress import track
+
+
+def parse_targets(texts: list[str]) -> list[str]:
+    """PSNRs in dB as they were given, the smallest first.
+
+    Raises:
+      ConfigError: one of them is not a number.
+    """
+    try:
+        return sorted(texts, key=float)
+    except ValueError:
+        raise ConfigError(f"--targets: {texts} are not all numbers; give some like 25,28") from None
+
+
+def measure_run(
+    config, *, num_views: int, num_test_views: int, every: int, last_target: float, started: float
+) -> dict:
+    """Trains as a run does and looks at test views on the way, until the last target is reached.
+
+    Args:
+      config: see `experiments/configs/base.py`.
+      num_views: training views, drawn as those that a run begins with.
+      num_test_views: evenly spaced in the test split.
+      every: optimiser steps between two looks, rounded up to compiled calls.
+      last_target: dB.
+      started: `time.time()` when the clock began.
+
+    Returns:
+      `curve`, a list of `{"step", "seconds", "psnr"}`, one for each look; `scene`, `device` and
+      `num_test_views`.
+    """
+    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    problem = build_problem(config, scene)
+    initial = initial_views(scene, SEED, num_views)
+    view_ids = spread_evenly(scene.test, num_test_views)
+    steps, key = config.train.steps_per_call, run_key(SEED)
+    calls_between = -(-every // steps)
+    step = problem.make_step("random", initial, track, "train")
+    paused, curve = 0.0, []
+
+    with track(problem.calls_per_round * steps, f"train on {num_views} views", "steps") as bar:
+
+        def on_call(state, info):
+            nonlocal paused
+            calls = int(state.calls)
+            is_last = calls == problem.calls_per_round
+            reached = curve and curve[-1]["psnr"] >= last_target
+            if not reached and (calls % calls_between == 0 or is_last):
+                jax.block_until_ready(state.train)
+                stopped = time.time()
+                measures = evaluate_views(problem.render(state.train), scene, view_ids)
+                seconds = stopped - started - paused
+                curve.append({"step": calls * steps, "seconds": seconds, "psnr": measures["psnr"]})
+                paused += time.time() - stopped
+            bar.advance(steps, psnr=curve[-1]["psnr"] if curve else np.nan)
+
+        fresh = problem.init_train(jax.random.fold_in(key, 2**31 - 1))
+        step(key, init_active_state(fresh, problem.table, initial), None, on_call)
+    return {
+        "curve": curve,
+        "scene": scene.name,
+        "device": device_name(),
+        "num_test_views": len(view_ids),
+    }
+
+
+def first_seconds(curve: list[dict], targets: list[str]) -> dict[str, float | None]:
+    """By target, seconds until it was first seen to be reached; None if it never was."""
+    return {
+        target: next((p["seconds"] for p in curve if p["psnr"] >= float(target)), None)
+        for target in targets
+    }

@@ -1,0 +1,99 @@
+"""What is measured: one scene, its compiled parts and the views that are trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from bavs_jax.cameras import Cameras, take
+from bavs_jax.candidates import scene_hemisphere
+from bavs_jax.scenes import Scene
+from bavs_jax.training.train import TrainState
+from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation, Toolbox
+from bavs_jax.uncertainty.scoring import reduced_cameras
+from bavs_jax.uncertainty.streaming import training_pixels
+from experiments.build import Problem, build_problem, run_key
+from experiments.build_scene import initial_views
+from experiments.build_trainer import Trainer, build_trainer, train_aside
+from experiments.progress import track
+
+SEED = 0
+
+
+class Subject(NamedTuple):
+    """The parts of a run of `experiments.active_selection` with the same config."""
+
+    config: object
+    problem: Problem
+    toolbox: Toolbox
+    trainer: Trainer
+    is_training_view: np.ndarray  # [V] bool
+    count_samples: Callable  # (TrainState, rays [R]) -> samples of each ray [R]
+
+    @property
+    def scene(self) -> Scene:
+        return self.problem.scene
+
+
+def changed(config, **values):
+    """A copy of a config with other values; `__` in a name stands for a dot."""
+    copy = config.copy_and_resolve_references()
+    copy.update_from_flattened_dict({k.replace("__", "."): v for k, v in values.items()})
+    return copy
+
+
+def make_subject(config, scene: Scene, num_views: int) -> Subject:
+    """Puts the parts together; compiles nothing yet.
+
+    Args:
+      config: see `experiments/configs/base.py`.
+      scene: the scene.
+      num_views: training views, drawn as those that a run begins with.
+    """
+    problem = build_problem(changed(config, lpips_net=""), scene)
+    is_training = np.zeros(len(problem.table.cameras), bool)
+    is_training[initial_views(scene, SEED, num_views)] = True
+    trainer = build_trainer(config, scene, len(is_training), RECONSTRUCTION)
+    sampler = trainer.sampler
+
+    @jax.jit
+    def count_samples(state, rays):
+        samples, _ = sampler.sample(None, state.params["sampler"], state.sampler_state, rays)
+        return samples.sample_mask.sum(-1)
+
+    toolbox = problem.make_toolbox(track)
+    return Subject(config, problem, toolbox, trainer, is_training, count_samples)
+
+
+def train_field(subject: Subject) -> TrainState:
+    """The field at the end of its training."""
+    situation = Situation(
+        *(None, subject.problem.table, subject.is_training_view, 0), label=subject.scene.name
+    )
+    key = run_key(SEED)
+    return train_aside(subject.config, subject.trainer, key, situation, RECONSTRUCTION, track)
+
+
+def draw_training_pixels(subject: Subject, num: int) -> tuple[np.ndarray, np.ndarray]:
+    """View ids and row numbers [num] of pixels, uniform over those that are trained on."""
+    view_ids, within = training_pixels(subject.problem.table, subject.is_training_view)
+    rows = np.random.default_rng(SEED).integers(0, len(view_ids), num)
+    return view_ids[rows], within[rows]
+
+
+def pixel_centres(cameras: Cameras, view_ids: np.ndarray, within: np.ndarray) -> np.ndarray:
+    """Pixel coordinates [num, 2] of row numbers."""
+    width = np.asarray(cameras.sizes)[view_ids, 0]
+    return np.stack([within % width, within // width], axis=-1).astype(np.float32) + 0.5
+
+
+def draw_candidates(subject: Subject, num: int, width: int) -> Cameras:
+    """Cameras on the hemisphere (Eq 14) with images `width` pixels wide, shaped like the photos."""
+    scene = subject.scene
+    first = take(scene.cameras, np.full(num, scene.pool[0]))
+    poses = scene_hemisphere(jax.random.key(SEED), scene, num)
+    scale = width / float(first.sizes[0, 0])
+    return reduced_cameras(first.replace(world_from_cam=poses), scale)

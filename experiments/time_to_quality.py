@@ -1,0 +1,137 @@
+"""Measures how long it takes from starting a process to a field of 25, 28 and 30 dB.
+
+    python -m experiments.time_to_quality --workdir=runs/quality
+    python -m experiments.time_to_quality --workdir=runs/quality_lego \\
+        --config=experiments/configs/blender.py --config.data_dir=FOLDER
+
+Starts a fresh process twice, first with an empty compilation cache, then with what the first has
+left there, and writes `time_to_quality.json` and `time_to_quality.html`. The clock runs from the
+start of the process, with imports, loading and compilation, and stands while test views are
+measured. The procedural scene's photos are made before.
+"""
+
+from __future__ import annotations
+
+import json
+import pathlib
+import shutil
+import subprocess
+import sys
+import time
+
+from absl import flags
+from ml_collections import config_flags
+
+from experiments import runtime
+from experiments.bench.page import quality_sections, write_page
+from experiments.bench.quality import first_seconds, measure_run, parse_targets
+from experiments.bench.results import QUALITY, quality_parts
+from experiments.build_scene import load_config_scene
+from experiments.configs import base
+from experiments.errors import USER_ERRORS
+from experiments.files import write_json
+from experiments.machine import versions
+from experiments.report.tables import markdown_parts
+
+FLAGS = flags.FLAGS
+config_flags.DEFINE_config_file(
+    "config",
+    base.__file__,
+    "The scene, the field and how it is trained; every option is explained in "
+    "experiments/configs/base.py and can be set as --config.name=value.",
+    lock_config=True,
+)
+flags.DEFINE_string("workdir", None, "Folder for time_to_quality.json and its page.")
+flags.DEFINE_integer("num_views", 20, "Training views.")
+flags.DEFINE_integer("num_test_views", 25, "Test views, evenly spaced.")
+flags.DEFINE_integer("every", 128, "Optimiser steps between two looks at the test views.")
+flags.DEFINE_list("targets", ["25", "28", "30"], "PSNR in dB, the smallest first.")
+PREPARE, CACHES = "prepare", ("cold", "warm")
+flags.DEFINE_enum("part", None, (PREPARE, *CACHES), "Set by the script itself: a part of its work.")
+flags.DEFINE_float("started", None, "Set by the script itself: when that part was started.")
+
+SCHEMA_VERSION = 1
+
+
+def start_process(folder: pathlib.Path, part: str) -> dict | None:
+    """One part in a process of its own; what it wrote, if anything.
+
+    This process never touches the device, which a second one might not be able to share.
+    """
+    command = [sys.executable, "-m", "experiments.time_to_quality", *sys.argv[1:]]
+    path = folder / f"{part}.json"
+    path.unlink(missing_ok=True)
+    done = subprocess.run([*command, f"--part={part}", f"--started={time.time()!r}"], check=False)
+    if done.returncode:
+        sys.exit(done.returncode)
+    if not path.exists():
+        return None
+    found = json.loads(path.read_text(encoding="utf-8"))
+    path.unlink()
+    return found
+
+
+def run_part(config, folder: pathlib.Path, part: str, targets: list[str]) -> None:
+    """What a process that `start_process` has started does."""
+    if part == PREPARE:
+        load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+        return
+    print(f"{part} compilation cache:", flush=True)
+    runtime.use_compilation_cache(folder / "compiled")
+    found = measure_run(
+        config,
+        num_views=FLAGS.num_views,
+        num_test_views=FLAGS.num_test_views,
+        every=FLAGS.every,
+        last_target=float(targets[-1]),
+        started=FLAGS.started,
+    )
+    seconds = first_seconds(found["curve"], targets)
+    write_json(folder / f"{part}.json", {"seconds_to_db": seconds, **found})
+
+
+def compare_caches(config, folder: pathlib.Path, command: str) -> None:
+    """Both runs, one after another, and the files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder / "compiled", ignore_errors=True)
+    start_process(folder, PREPARE)
+    runs = {cache: start_process(folder, cache) for cache in CACHES}
+    common = {name: runs["cold"][name] for name in ("device", "scene", "num_test_views")}
+    result = {
+        "schema_version": SCHEMA_VERSION,
+        **common,
+        "runs": {
+            cache: {name: run[name] for name in ("seconds_to_db", "curve")}
+            for cache, run in runs.items()
+        },
+        "num_views": FLAGS.num_views,
+        "config": config.to_dict(),
+        "command": command,
+        "versions": versions(),
+    }
+    write_json(folder / QUALITY, result)
+    page = folder / "time_to_quality.html"
+    title = f"Time to quality: {result['scene']}, {FLAGS.num_views} views"
+    write_page(page, title=title, made=result, sections=quality_sections(result))
+    print(markdown_parts(quality_parts(folder / QUALITY)))
+    print(f"numbers: {folder / QUALITY}")
+    print(f"page:    {page}")
+
+
+def main() -> None:
+    if not FLAGS.workdir:
+        sys.exit("error: --workdir: is missing; name a folder for the results")
+    config, folder = FLAGS.config, pathlib.Path(FLAGS.workdir)
+    config.lpips_net = ""
+    try:
+        targets = parse_targets(FLAGS.targets)
+        if FLAGS.part is None:
+            compare_caches(config, folder, runtime.command_line())
+        else:
+            run_part(config, folder, FLAGS.part, targets)
+    except USER_ERRORS as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    runtime.run_script(main)

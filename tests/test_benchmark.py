@@ -1,0 +1,211 @@
+"""The benchmark: what is counted, what is fitted, and a tiny run from end to end."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.bench.ceilings import measure_ceilings
+from experiments.bench.clock import timed
+from experiments.bench.counts import Work, compiled_work
+from experiments.bench.fits import fit_growth
+from experiments.bench.measure import benchmark
+from experiments.bench.results import BENCHMARK, STAGES, amount, benchmark_parts, duration
+from experiments.bench.settings import default_sizes
+from experiments.bench.work import slot_width
+from experiments.report.tables import markdown_parts
+from tests.toy_runs import toy_config
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+SIZES = {
+    "repeats": 2,
+    "train_calls": 1,
+    "render_rays": 4096,
+    "curvature_rays": 512,
+    "candidates": 4,
+    "candidate_pixels": 8,
+    "select_candidates": 32,
+    "batch_size": 4,
+    "matmul": 256,
+    "copy_mb": 1,
+    "growth.repeats": 1,
+    "growth.train_calls": 1,
+    # Two sizes where nothing is compiled anew.
+    "growth.train_rays": (64,),
+    "growth.render_rays": (2048, 4096),
+    "growth.curvature_rays": (256, 512),
+    "growth.grid_log2": (4,),
+    "growth.grid_rays": 128,
+    "growth.candidates": (8, 16),
+    "growth.candidate_pixels": 4,
+    "growth.batch_size": (2,),
+}
+
+
+# --- counts ----------------------------------------------------------------------------------
+
+
+def test_matrix_product_is_counted_as_its_closed_form():
+    m, k, n = 48, 32, 16
+    work = compiled_work(jnp.matmul, jnp.ones((m, k)), jnp.ones((k, n)))
+    assert work.flops == 2 * m * k * n
+    assert work.bytes == 4 * (m * k + k * n + m * n)
+
+
+def test_counts_need_shapes_only_and_know_that_fused_steps_pass_nothing_through_memory():
+    x = jax.ShapeDtypeStruct((1000,), jnp.float32)
+    work = compiled_work(lambda x: 2.0 * x + 1.0, x)
+    assert work == Work(flops=2 * 1000, bytes=2 * 4 * 1000)
+
+
+def test_unrolled_steps_add_up_and_a_loop_counts_once():
+    a = jnp.ones((32, 32))
+    product = compiled_work(jnp.matmul, a, a)
+    unrolled = compiled_work(lambda a: a @ a @ a @ a, a)
+    assert unrolled.flops == (product * 3).flops
+    loop = compiled_work(lambda a: jax.lax.fori_loop(0, 3, lambda _, x: x @ a, a), a)
+    # The loop's own counter is counted too.
+    np.testing.assert_allclose(loop.flops, product.flops, rtol=1e-3)
+
+
+def test_work_adds_subtracts_and_scales():
+    assert (Work(5.0, 7.0) + Work(1.0, 1.0)) * 2 - Work(2.0, 6.0) == Work(10.0, 10.0)
+
+
+@pytest.mark.parametrize("mean, width", [(0.3, 8), (8.0, 8), (8.1, 16), (33.0, 64), (100.0, 64)])
+def test_slot_width_holds_the_mean_ray(mean, width):
+    assert slot_width(mean, 64) == width
+
+
+# --- ceilings and clock ----------------------------------------------------------------------
+
+
+def test_ceilings_are_what_the_best_run_reached(monkeypatch):
+    """With a clock that says 4 s, then 2 s, for each kind of program."""
+    runs = iter([([4.0, 2.0], []), ([4.0, 2.0], [])])
+    monkeypatch.setattr("experiments.bench.ceilings.timed_runs", lambda fn, repeats: next(runs))
+    ceilings = measure_ceilings(matmul=100, copy_mb=1, repeats=2)
+    assert ceilings.flops_per_s == 2 * 100**3 / 2.0
+    assert ceilings.bytes_per_s == 2 * 10**6 / 2.0
+
+
+def test_timing_waits_for_the_result():
+    seconds, value = timed(lambda: jnp.arange(3) + 1)
+    assert seconds > 0
+    np.testing.assert_array_equal(value, [1, 2, 3])
+
+
+# --- fits ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 3.0])
+def test_power_laws_give_their_exponent(exponent):
+    sizes = np.array([5, 10, 40, 100])
+    fit = fit_growth(sizes, 0.02 * sizes**exponent)
+    np.testing.assert_allclose(fit.exponent, exponent, atol=1e-10)
+
+
+def test_a_fixed_cost_is_told_from_linear_growth():
+    sizes = np.array([25, 100, 400, 1000])
+    fit = fit_growth(sizes, 0.3 + 0.001 * sizes)
+    np.testing.assert_allclose([fit.intercept_s, fit.slope_s], [0.3, 0.001], rtol=1e-9)
+    assert fit.largest_deviation < 1e-9 and 0.0 < fit.exponent < 1.0
+
+
+def test_what_is_not_linear_is_off_the_line():
+    sizes = np.array([1.0, 2.0, 4.0, 8.0])
+    assert fit_growth(sizes, sizes**2).largest_deviation > 0.2
+
+
+@pytest.mark.parametrize(
+    "value, text", [(0.5, "0.5 "), (1234.0, "1.23 k"), (5e6, "5 M"), (2.2e11, "220 G")]
+)
+def test_amounts_have_three_digits_and_a_prefix(value, text):
+    assert amount(value) == text
+
+
+@pytest.mark.parametrize(
+    "seconds, text", [(2e-4, "0.2 ms"), (0.9994, "999 ms"), (0.9999, "1.00 s"), (75.0, "75.0 s")]
+)
+def test_durations_change_to_milliseconds_below_one_second(seconds, text):
+    assert duration(seconds) == text
+
+
+# --- end to end ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def measured(quick_compilation, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("benchmark")
+    sizes = default_sizes()
+    sizes.update_from_flattened_dict(SIZES)
+    config = toy_config(train__num_steps=16, march__num_slots=8)
+    benchmark(config, sizes, folder, num_views=3, growth=True, profile=True, command="command")
+    return folder
+
+
+def positive(*numbers) -> bool:
+    flat = np.concatenate([np.ravel(number) for number in numbers])
+    return bool(np.all(np.isfinite(flat)) and np.all(flat > 0))
+
+
+def test_every_number_is_there_and_positive(measured):
+    result = json.loads((measured / "benchmark.json").read_text())
+    rates = ("train", "render", "curvature")
+    keys = [f"{name}_rays_per_s" for name in rates] + ["train_samples_per_s", "candidates_per_s"]
+    assert positive(*(result[key] for key in (*keys, "batch_select_ms", "peak_memory_mb")))
+    assert isinstance(result["device"], str) and result["device"]
+    assert result["stages"].keys() == STAGES.keys()
+    for stage in result["stages"].values():
+        unit = stage["unit"]
+        left_out = ("unit", "peak_device_memory_so_far_mb")
+        assert positive(*(v for k, v in stage.items() if k not in left_out))
+        assert len(stage["run_s"]) == 2
+        np.testing.assert_allclose(
+            stage["flops_per_s"] * stage["median_run_s"], stage["flops_per_run"], rtol=1e-9
+        )
+        assert stage[f"{unit}_per_run"] <= stage[f"{unit}_per_s"] * max(stage["run_s"]) * (1 + 1e-9)
+    assert positive(*result["ceilings"].values())
+
+
+def test_memory_never_shrinks_and_more_samples_are_more_work(measured):
+    result = json.loads((measured / "benchmark.json").read_text())
+    memory = [stage["peak_memory_so_far_mb"] for stage in result["stages"].values()]
+    memory.append(result["peak_memory_mb"])
+    for row in result["growth"].values():
+        memory += row["peak_memory_so_far_mb"]
+    assert np.all(np.diff(memory) >= 0)
+    # A ray that is trained on is rendered, differentiated and one of many of its step.
+    per_ray = {
+        name: result["stages"][name]["flops_per_run"] / result["stages"][name]["rays_per_run"]
+        for name in ("train", "render", "curvature")
+    }
+    assert per_ray["render"] < per_ray["train"] and per_ray["render"] < per_ray["curvature"]
+
+
+def test_growth_has_a_fit_for_each_series(measured):
+    growth = json.loads((measured / "benchmark.json").read_text())["growth"]
+    assert growth.keys() == {
+        *("train_rays", "render_rays", "curvature_rays", "curvature_grid"),
+        *("score_candidates", "select_candidates", "select_batch"),
+    }
+    assert growth["curvature_grid"]["sizes"] == [16]  # 2^4 cells per side
+    for row in growth.values():
+        assert np.all(np.diff(row["sizes"]) > 0) and len(row["sizes"]) == len(row["median_s"])
+        assert positive(row["median_s"])
+        if len(row["sizes"]) == 1:
+            assert row["fit"] is None
+        else:
+            assert np.isfinite(list(row["fit"].values())).all()
+
+
+def test_page_tables_and_trace_are_written(measured):
+    page = (measured / "benchmark.html").read_text()
+    assert page.count("<svg") == 1 + 7 and "scoring candidates" in page
+    tables = markdown_parts(benchmark_parts(measured / BENCHMARK))
+    assert tables.startswith("`command` (") and tables.count("\n| --- |") == 2
+    assert "one size only" in tables
+    assert list((measured / "trace").rglob("*.xplane.pb"))

@@ -1,0 +1,59 @@
+"""Time to quality: when a target counts as reached, and the script with fresh processes."""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from experiments.bench.quality import first_seconds, parse_targets
+from experiments.bench.results import QUALITY, quality_parts
+from experiments.errors import ConfigError
+from experiments.report.tables import markdown_parts
+from tests.toy_runs import toy_flags
+
+ROOT = pathlib.Path(__file__).parents[1]
+
+
+def test_a_target_is_reached_where_it_is_first_seen():
+    curve = [
+        {"step": n, "seconds": s, "psnr": p}
+        for n, s, p in ((1, 2.0, 20.0), (2, 3.0, 25.0), (3, 4.0, 24.0), (4, 5.0, 28.5))
+    ]
+    assert first_seconds(curve, ["25", "28", "30"]) == {"25": 3.0, "28": 5.0, "30": None}
+
+
+def test_script_measures_with_a_cold_and_a_warm_cache(tmp_path):
+    command = [sys.executable, "-m", "experiments.time_to_quality", f"--workdir={tmp_path}"]
+    command += [*toy_flags(train__num_steps=16, train__steps_per_call=8, march__num_slots=8)]
+    command += ["--num_views=3", "--num_test_views=2", "--every=8", "--targets=99,5"]
+    quick = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "XDG_CACHE_HOME": str(tmp_path)}
+    done = subprocess.run(
+        command, cwd=ROOT, env=os.environ | quick, capture_output=True, text=True, timeout=900
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "time_to_quality.json").read_text())
+    assert result["runs"].keys() == {"cold", "warm"} and result["num_test_views"] == 2
+    for run in result["runs"].values():
+        assert [point["step"] for point in run["curve"]] == [8, 16]
+        seconds = [point["seconds"] for point in run["curve"]]
+        assert 0 < seconds[0] < seconds[1]
+        # 5 dB is less than any image in [0, 1] is likely to have; 99 dB is out of reach.
+        assert run["seconds_to_db"] == {"5": seconds[0], "99": None}
+    cold, warm = (run["curve"] for run in result["runs"].values())
+    np.testing.assert_allclose(  # the same seed and the same programs
+        [point["psnr"] for point in cold], [point["psnr"] for point in warm], atol=1e-3
+    )
+    assert any((tmp_path / "compiled").iterdir())
+    assert not (tmp_path / "cold.json").exists()
+    assert "not reached" in markdown_parts(quality_parts(tmp_path / QUALITY))
+    assert (tmp_path / "time_to_quality.html").read_text().count("<svg") == 1
+
+
+def test_targets_are_sorted_as_numbers_and_others_refused():
+    assert parse_targets(["28", "9.5", "25"]) == ["9.5", "25", "28"]
+    with pytest.raises(ConfigError, match="--targets"):
+        parse_targets(["25", "high"])
