@@ -1,0 +1,103 @@
+"""What a sweep varies: `policy=random,farthest`, `seed=0:5`, `config.uncertainty.log2_cells=5,6`."""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import re
+from typing import Any, NamedTuple
+
+from experiments.errors import ConfigError
+
+OWN_AXES = {"policies": "policy", "seeds": "seed"}  # options that are axes of their own
+
+
+class Axes(NamedTuple):
+    """The values of every axis."""
+
+    policies: tuple[str, ...]
+    seeds: tuple[int, ...]
+    options: dict[str, tuple]  # values of each option of the config, by its dotted name
+
+
+def parse_axes(texts: list[str], config) -> Axes:
+    """Reads `name=value,value` of each axis; policies and seeds not named are the config's.
+
+    Args:
+      texts: one for each axis. Values of type int may be a range, `first:end` or
+        `first:end:step` without the end. Commas inside brackets belong to a value.
+      config: tells which options there are, and of what type.
+
+    Raises:
+      ConfigError: an axis that is unknown, given twice or empty, or a value of another type.
+    """
+    found = {}
+    for text in texts:
+        name, equals, values = text.partition("=")
+        if not equals or not values:
+            raise ConfigError(f"--axis={text}: give name=value,value, such as seed=0:5")
+        if name in found:
+            raise ConfigError(f"--axis={text}: {name} is given twice")
+        found[name] = _values(name, values, _example(name, text, config))
+    return Axes(
+        policies=found.pop("policy", tuple(config.policies)),
+        seeds=found.pop("seed", tuple(config.seeds)),
+        options={name.removeprefix("config."): values for name, values in found.items()},
+    )
+
+
+def settings(axes: Axes) -> list[dict[str, Any]]:
+    """Every combination of the options' values; one that is empty where there are no options."""
+    return [dict(zip(axes.options, row)) for row in itertools.product(*axes.options.values())]
+
+
+def setting_name(values: dict[str, Any]) -> str:
+    """The folder of a setting, such as `uncertainty.log2_cells=5`; `.` where nothing is set."""
+    name = ",".join(f"{option}={value}" for option, value in values.items())
+    return re.sub(r"[^\w.,=+-]+", "_", name) or "."
+
+
+def _example(name: str, text: str, config):
+    """A value of the axis, for its type."""
+    if name in OWN_AXES.values():
+        return "" if name == "policy" else 0
+    option = name.removeprefix("config.")
+    if option in OWN_AXES:
+        raise ConfigError(f"--axis={text}: sweep over {OWN_AXES[option]}=... instead")
+    known = config.to_dict()
+    for key in option.split("."):
+        if option == name or not isinstance(known, dict) or key not in known:
+            raise ConfigError(
+                f"--axis={text}: no axis {name}; use policy, seed or config.NAME with an option "
+                "of experiments/configs/base.py"
+            )
+        known = known[key]
+    if isinstance(known, dict):
+        raise ConfigError(f"--axis={text}: {option} is a group of options; name one of {(*known,)}")
+    return known
+
+
+def _values(name: str, text: str, example) -> tuple:
+    values = []
+    for item in re.split(r",(?![^(\[]*[)\]])", text):
+        is_range = type(example) is int and re.fullmatch(r"-?\d+(:-?\d+){1,2}", item)
+        values += range(*map(int, item.split(":"))) if is_range else [_value(name, item, example)]
+    if not values or len(set(values)) < len(values):
+        raise ConfigError(f"--axis={name}={text}: has no value, or one of them twice")
+    return tuple(values)
+
+
+def _value(name: str, text: str, example):
+    if isinstance(example, str):
+        return text
+    try:
+        value = ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        value = None
+    if isinstance(example, float) and type(value) is int:
+        value = float(value)
+    if type(value) is not type(example):
+        raise ConfigError(
+            f"--axis={name}: {text!r} is not of type {type(example).__name__}, as {example!r} is"
+        )
+    return value
