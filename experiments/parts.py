@@ -36,7 +36,9 @@ def all_parts(policies, seeds) -> list[Part]:
     Raises:
       SelectionError: a policy that does not exist.
     """
-    parts = [Part(policy, get_policy(policy).field_kind, seed) for seed in seeds for policy in policies]
+    parts = [
+        Part(policy, get_policy(policy).field_kind, seed) for seed in seeds for policy in policies
+    ]
     return list(dict.fromkeys(p for part in parts for p in (part.initial, part)))
 
 

@@ -1,4 +1,4 @@
-"""What a sweep varies: `policy=random,farthest`, `seed=0:5`, `config.uncertainty.log2_cells=5,6`."""
+"""What a sweep varies: policies, seeds and options, such as `config.uncertainty.log2_cells=5,6`."""
 
 from __future__ import annotations
 

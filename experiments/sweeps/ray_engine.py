@@ -47,19 +47,22 @@ class RayEngine:
 
     def wait(self, seconds: float) -> list[Ended]:
         done, _ = self._ray.wait(list(self._running), timeout=seconds)
-        return [Ended(self._running.pop(ref), self._code(ref)) for ref in done]
+        ended = [(self._running.pop(ref), ref) for ref in done]
+        return [Ended(job, self._code(job, ref)) for job, ref in ended]
 
     def stop(self) -> None:
         for ref in self._running:
             self._ray.cancel(ref, force=True)
         self._ray.shutdown()
 
-    def _code(self, ref) -> int | None:
+    def _code(self, job: Job, ref) -> int | None:
         try:
             return self._ray.get(ref)
         except self._ray.exceptions.RayTaskError as error:
-            # The worker lives, and could not even start the process.
-            raise error.as_instanceof_cause() from None
+            # The worker lives, but could not even start the process.
+            with open(job.log, "a", encoding="utf-8") as file:
+                file.write(f"{error}\n")
+            return 1
         except self._ray.exceptions.RayError:
             return None
 
