@@ -54,7 +54,7 @@ def disturbed(cache, tmp_path_factory):
 
 
 def test_ctrl_c_stops_every_process_and_says_so(disturbed):
-    work, (code, out), left, _ = disturbed
+    _, (code, out), left, _ = disturbed
     assert code == 130 and "the same command goes on" in out and "Traceback" not in out
     assert left == []
 

@@ -17,6 +17,8 @@ class Cell:
 
     text: str
     why: str | None = None
+    interval: stats.Interval | None = None  # what the text rounds
+    p_value: float | None = None  # of a gap
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,11 +52,20 @@ def missing_measure(measure: stats.Measure, runs: list[Run]) -> str:
 
 
 def interval_cell(interval: stats.Interval | None, digits: int, why: str, *, gap=False) -> Cell:
-    """`mean ± half`, without the half where there is one seed."""
+    """`mean ± half`, without the half where there is one seed; of a gap also how sure it is."""
     if interval is None:
         return dash(why)
     mean = signed(interval.mean, digits) if gap else f"{interval.mean:.{digits}f}"
-    return Cell(mean if interval.half is None else f"{mean} ± {interval.half:.{digits}f}")
+    text = mean if interval.half is None else f"{mean} ± {interval.half:.{digits}f}"
+    p_value = stats.paired_p_value(interval) if gap else None
+    if p_value is not None:
+        text += f" ({p_words(p_value)})"
+    return Cell(text, interval=interval, p_value=p_value)
+
+
+def p_words(p_value: float) -> str:
+    """A p-value, as exactly as it matters."""
+    return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.2g}"
 
 
 def final_table(runs: list[Run], policies: list[str]) -> Table:
