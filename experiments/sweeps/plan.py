@@ -7,6 +7,7 @@ import pathlib
 from functools import partial
 from typing import Any, NamedTuple
 
+from experiments.errors import ConfigError
 from experiments.parts import Part, all_parts, is_finished
 from experiments.sweeps.axes import Axes, setting_name, settings
 from experiments.sweeps.schedule import Job
@@ -37,6 +38,7 @@ def make_settings(config, axes: Axes, workdir: pathlib.Path) -> list[Setting]:
 
     Raises:
       SelectionError: a policy that does not exist.
+      ConfigError: two settings whose folders would have the same name.
     """
     made = []
     for values in settings(axes):
@@ -45,6 +47,8 @@ def make_settings(config, axes: Axes, workdir: pathlib.Path) -> list[Setting]:
         own.update_from_flattened_dict(values)
         name = setting_name(values)
         parts = all_parts(axes.policies, axes.seeds)
+        if name in [setting.name for setting in made]:
+            raise ConfigError(f"--axis: two settings would share the folder {name}; drop one")
         made.append(Setting(values, name, workdir / name, own, parts))
     return made
 
