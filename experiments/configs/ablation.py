@@ -12,7 +12,7 @@ images; the weighting; the channel; and rounds against the paper's single batch:
     --axis=config.uncertainty.weighting=eq13,eq11,empirical
     --axis=config.uncertainty.variant=posterior,bayesrays
     --axis=config.num_rounds+config.batch_size=4+4,2+8,1+16
-"""  # noqa: E501
+"""
 
 from experiments.configs import rivals
 
