@@ -3,8 +3,6 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from experiments.sweeps.axes import parse_axes, setting_name, settings
 from experiments.sweeps.plan import make_settings, make_trials
 from experiments.sweeps.record import Record, merged, read_record, write_record
 from tests.sweep_runs import (
-    ROOT,
     attempts,
     end_of,
     last_checkpoint,
@@ -73,19 +70,6 @@ def test_nothing_is_lost_or_run_twice(disturbed):
     assert (work / "report.html").exists() and (work / "next_views" / "transforms.json").exists()
 
 
-def test_results_are_those_of_a_single_run(disturbed, cache, tmp_path):
-    """The run that was killed, against the same made by the script for one experiment."""
-    work, *_ = disturbed
-    script = [sys.executable, "-m", "experiments.active_selection", f"--workdir={tmp_path}"]
-    flags = [*FLAGS, "--config.policies=('random',)"]
-    env = os.environ | {"XDG_CACHE_HOME": str(cache)}
-    subprocess.run([*script, *flags], cwd=ROOT, env=env, check=True, stdout=subprocess.DEVNULL)
-    for a, b in zip(result(work, "random", 0)["rounds"], result(tmp_path, "random", 0)["rounds"]):
-        assert a["selected"] == b["selected"]
-        # Threads of the CPU may add up in another order.
-        np.testing.assert_allclose(a["psnr"], b["psnr"], atol=1e-3)
-
-
 def test_a_finished_sweep_runs_nothing_again(disturbed, cache):
     work, *_ = disturbed
     before = (work / "random" / "seed_0" / "result.json").stat().st_mtime_ns
@@ -95,17 +79,33 @@ def test_a_finished_sweep_runs_nothing_again(disturbed, cache):
     assert attempts(work / "farthest" / "seed_0") == 1
 
 
-def test_a_setting_that_fails_does_not_stop_the_others(cache, tmp_path):
+@pytest.fixture(scope="module")
+def half_failed(cache, tmp_path_factory):
+    """A sweep over a setting that cannot be run and one that can, which nothing disturbs."""
+    work = tmp_path_factory.mktemp("half")
     flags = [*FLAGS, "--axis=policy=random", "--axis=config.num_initial=1000,2", "--jobs=1"]
-    code, out = end_of(start_sweep([*flags, f"--workdir={tmp_path}"], cache))
+    return work, end_of(start_sweep([*flags, f"--workdir={work}"], cache))
+
+
+def test_a_setting_that_fails_does_not_stop_the_others(half_failed):
+    work, (code, out) = half_failed
     assert code == 1 and "Traceback" not in out
-    log = tmp_path / "num_initial=1000" / "initial" / "seed_0" / "log.txt"
+    log = work / "num_initial=1000" / "initial" / "seed_0" / "log.txt"
     assert "num_initial is 1000, but the pool has 100" in out and str(log) in out
-    assert result(tmp_path / "num_initial=2", "random", 0)["completed"]
-    record = read_record(tmp_path)
+    assert result(work / "num_initial=2", "random", 0)["completed"]
+    record = read_record(work)
     why = record.missing("num_initial=1000", set())
     assert why.keys() == {("random", 0)} and "has failed" in why["random", 0]
     assert record.missing("num_initial=2", {("random", 0)}) == {}
+
+
+def test_a_run_that_was_stopped_and_killed_ends_like_an_undisturbed_one(disturbed, half_failed):
+    killed = result(disturbed[0], "random", 0)["rounds"]
+    undisturbed = result(half_failed[0] / "num_initial=2", "random", 0)["rounds"]
+    for a, b in zip(killed, undisturbed, strict=True):
+        assert a["selected"] == b["selected"]
+        # Threads of the CPU may add up in another order.
+        np.testing.assert_allclose(a["psnr"], b["psnr"], atol=1e-3)
 
 
 # --- axes, plan and record, without running anything ---
