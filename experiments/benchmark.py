@@ -20,11 +20,11 @@ from ml_collections import config_flags
 
 from experiments import runtime
 from experiments.bench.measure import benchmark
-from experiments.bench.results import BENCHMARK, benchmark_parts
+from experiments.bench.results import BENCHMARK, benchmark_tables
 from experiments.bench.settings import default_sizes
 from experiments.configs import base
 from experiments.errors import USER_ERRORS
-from experiments.report.tables import markdown_parts
+from experiments.report.collected import collected_text
 
 FLAGS = flags.FLAGS
 config_flags.DEFINE_config_file(
@@ -63,7 +63,7 @@ def main() -> None:
         )
     except USER_ERRORS as error:
         sys.exit(f"error: {error}")
-    print(markdown_parts(benchmark_parts(folder / BENCHMARK)))
+    print(collected_text(benchmark_tables(folder / BENCHMARK)))
     print(f"numbers: {folder / BENCHMARK}")
     print(f"page:    {folder / 'benchmark.html'}  ({result['total_s']:.0f} s in all)")
     if FLAGS.profile:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import os
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -36,6 +38,26 @@ def write_arrays(path: str | os.PathLike, **arrays) -> None:
 
 
 def append_line(path: str | os.PathLike, value: dict) -> None:
-    """One JSON object as a line at the end of a file."""
-    with open(path, "a", encoding="utf-8") as file:
-        file.write(json.dumps(value, allow_nan=False) + "\n")
+    """One JSON object as a line at the end of a file that several processes may write to."""
+    line = json.dumps(value, allow_nan=False) + "\n"
+    with open(path, "ab", buffering=0) as file:
+        # The lock is for folders that machines share: only there may two lines overlap.
+        fcntl.flock(file, fcntl.LOCK_EX)
+        file.write(line.encode())
+
+
+@contextlib.contextmanager
+def exclusive(folder: str | os.PathLike) -> Iterator[None]:
+    """Waits until no other process works in a folder, and keeps others out until the end.
+
+    The lock ends with the process that holds it: one that is killed leaves none behind.
+    """
+    folder = pathlib.Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    with open(folder / ".lock", "wb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            print(f"{folder}: another process works here; waiting for its end", flush=True)
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield

@@ -14,7 +14,7 @@ import numpy as np
 
 from bavs_jax.active import ActiveState, Choice, init_active_state
 from bavs_jax.training.checkpoints import Checkpoints
-from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
+from bavs_jax.uncertainty.model import Situation
 from experiments import acquisitions
 from experiments.baselines import measure_baselines
 from experiments.build import Problem, run_key
@@ -22,6 +22,7 @@ from experiments.build_scene import initial_views
 from experiments.evaluate import evaluate_views, picture_arrays, spread_evenly
 from experiments.files import append_line, write_arrays, write_json
 from experiments.machine import device_name, peak_memory_mb, versions
+from experiments.parts import Part
 from experiments.predicted.cases import realised_gain
 from experiments.progress import track
 from experiments.report.choices import bound_words
@@ -42,8 +43,7 @@ class Run:
         self.command = command
         self.policy, self.seed = policy, seed
         self.label = f"{policy or 'initial'} seed {seed}"
-        own = "initial" if problem.kind == RECONSTRUCTION else f"initial_{problem.kind}"
-        self.folder = workdir / (policy or own) / f"seed_{seed}"
+        self.folder = workdir / Part(policy, problem.kind, seed).name
         self.initial = initial_views(problem.scene, seed, config.num_initial)
         self.rounds: list[dict] = []  # of result.json
         self.pending = _new_pending()  # what is known of the round under way
@@ -69,6 +69,8 @@ class Run:
             if self._is_trained(state) and number >= last_round:
                 break
             state = self._one_step(step, state)
+        if self.policy is None:
+            write_json(self.folder / "round_0.json", self.rounds[0])
         self.checkpoints.close()
 
     def state(self) -> ActiveState:
@@ -252,7 +254,7 @@ class Run:
         return measure_baselines(scene, used[used < scene.num_views], test_views)
 
     def _log(self, **values) -> None:
-        head = {"time": time.time(), "policy": self.policy or "initial", "seed": self.seed}
+        head = {"time": time.time(), "policy": self.folder.parent.name, "seed": self.seed}
         append_line(self.workdir / "metrics.jsonl", {**head, **values})
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pathlib
 import sys
+import threading
 from collections.abc import Callable
 
 import jax
@@ -33,6 +34,21 @@ def command_line() -> str:
     module = sys.modules["__main__"].__spec__
     name = f"python -m {module.name}" if module else f"python {sys.argv[0]}"
     return " ".join([name, *sys.argv[1:]])
+
+
+def end_with_parent() -> None:
+    """Ends this process as soon as its standard input is closed.
+
+    A program that starts this one through a pipe need do nothing more to take it along when it
+    is killed; what is lost is what a kill of this process loses.
+    """
+
+    def watch():
+        while os.read(sys.stdin.fileno(), 1024):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def run_script(main: Callable[[], None]) -> None:

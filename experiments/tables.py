@@ -1,11 +1,12 @@
-"""Turns result files into Markdown tables, and puts them into a page between markers.
+"""Turns result files into tables, and puts them into a page between markers.
 
-    python -m experiments.tables --workdir=runs/quickstart
+    python -m experiments.tables --workdir=runs/quickstart [--format=csv] [--paper=table_1]
     python -m experiments.tables --page=README.md
 
-The first prints the tables of one experiment. The second writes every table of a page anew: each
-stands between `<!-- results: FOLDER -->` and `<!-- end of results -->`, where FOLDER holds a result
-file of one of the scripts (`result_parts.py`) and is relative to the page.
+The first prints the tables of one experiment or sweep. The second writes every table of a page
+anew: each stands between `<!-- results: FOLDER -->` and `<!-- end of results -->`, where FOLDER
+holds a result file of any script and is relative to the page. On the same line, `tables=quality`
+names which tables, and `paper=table_1` the paper's whose rows are put beside ours.
 """
 
 from __future__ import annotations
@@ -17,26 +18,61 @@ import sys
 from absl import flags
 
 from experiments import runtime
+from experiments.errors import WorkdirError
 from experiments.files import write_atomic
 from experiments.report import ReportError
-from experiments.report.tables import markdown_parts
-from experiments.result_parts import result_parts
+from experiments.report.collected import collected_text
+from experiments.report.formats import FORMATS
+from experiments.result_files import collect_all
 
 FLAGS = flags.FLAGS
-flags.DEFINE_string("workdir", None, "Folder of an experiment: print its tables.")
+flags.DEFINE_string("workdir", None, "Folder of an experiment or of a sweep: print its tables.")
 flags.DEFINE_string("page", None, "Markdown file whose tables are written anew.")
+flags.DEFINE_enum("format", "markdown", [*FORMATS], "Of what --workdir prints.")
+flags.DEFINE_list("tables", None, "Which tables, such as quality,rounds; all by default.")
+flags.DEFINE_string("paper", None, "Table of the paper to put beside ours, such as table_1.")
 
-MARKED = re.compile(r"(<!-- results: (\S+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
+MARKED = re.compile(
+    r"(<!-- results: (\S+)((?: \w+=\S+)*) -->\n).*?(<!-- end of results -->)", re.DOTALL
+)
 
 
-def result_tables(folder: pathlib.Path) -> str:
-    """Words and tables about the experiment in a folder, as Markdown; see `result_parts`."""
-    return markdown_parts(result_parts(folder))
+def result_tables(
+    folder: pathlib.Path,
+    *,
+    form: str = "markdown",
+    names: list[str] | None = None,
+    paper: str | None = None,
+) -> str:
+    """The tables of all result files of a folder, with the commands that made them.
+
+    Args:
+      folder: where the result files are.
+      form: a key of `FORMATS`.
+      names: of the tables; None: all.
+      paper: a table of the paper; see `collect_tables`.
+
+    Raises:
+      ReportError: a file that cannot be used, or no such table.
+    """
+    found = collect_all(folder, paper)
+    return "\n".join(collected_text(one, form=form, names=names) for one in found)
 
 
 def fill_page(text: str, root: pathlib.Path) -> str:
     """The page with every marked table made anew from the results it names."""
-    return MARKED.sub(lambda m: f"{m[1]}{result_tables(root / m[2])}{m[3]}", text)
+
+    def filled(match: re.Match) -> str:
+        head, folder, options, end = match.groups()
+        given = dict(option.split("=", 1) for option in options.split())
+        names = given.pop("tables", None)
+        paper = given.pop("paper", None)
+        if given:
+            raise ReportError(f"results: {folder}: {next(iter(given))}= is not tables= or paper=")
+        names = names.split(",") if names else None
+        return f"{head}{result_tables(root / folder, names=names, paper=paper)}{end}"
+
+    return MARKED.sub(filled, text)
 
 
 def main() -> None:
@@ -44,12 +80,13 @@ def main() -> None:
         sys.exit("error: give either --workdir or --page")
     try:
         if FLAGS.workdir:
-            print(result_tables(pathlib.Path(FLAGS.workdir)))
+            folder, names = pathlib.Path(FLAGS.workdir), FLAGS.tables
+            print(result_tables(folder, form=FLAGS.format, names=names, paper=FLAGS.paper))
             return
         page = pathlib.Path(FLAGS.page)
         text = fill_page(page.read_text(encoding="utf-8"), page.parent)
         write_atomic(page, lambda file: file.write(text.encode()))
-    except (ReportError, OSError) as error:
+    except (ReportError, WorkdirError, OSError) as error:
         sys.exit(f"error: {error}")
 
 

@@ -25,13 +25,13 @@ from ml_collections import config_flags
 from experiments import runtime
 from experiments.bench.page import quality_sections, write_page
 from experiments.bench.quality import first_seconds, measure_run, parse_targets
-from experiments.bench.results import QUALITY, quality_parts
+from experiments.bench.results import QUALITY, quality_tables
 from experiments.build_scene import load_config_scene
 from experiments.configs import base
 from experiments.errors import USER_ERRORS
 from experiments.files import write_json
 from experiments.machine import versions
-from experiments.report.tables import markdown_parts
+from experiments.report.collected import collected_text
 
 FLAGS = flags.FLAGS
 config_flags.DEFINE_config_file(
@@ -113,7 +113,7 @@ def compare_caches(config, folder: pathlib.Path, command: str) -> None:
     page = folder / "time_to_quality.html"
     title = f"Time to quality: {result['scene']}, {FLAGS.num_views} views"
     write_page(page, title=title, made=result, sections=quality_sections(result))
-    print(markdown_parts(quality_parts(folder / QUALITY)))
+    print(collected_text(quality_tables(folder / QUALITY)))
     print(f"numbers: {folder / QUALITY}")
     print(f"page:    {page}")
 

@@ -12,10 +12,10 @@ from experiments.bench.clock import timed
 from experiments.bench.counts import Work, compiled_work
 from experiments.bench.fits import fit_growth
 from experiments.bench.measure import benchmark
-from experiments.bench.results import BENCHMARK, STAGES, amount, benchmark_parts, duration
+from experiments.bench.results import BENCHMARK, STAGES, amount, benchmark_tables, duration
 from experiments.bench.settings import default_sizes
 from experiments.bench.work import slot_width
-from experiments.report.tables import markdown_parts
+from experiments.report.collected import collected_text
 from tests.toy_runs import toy_config
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -205,7 +205,7 @@ def test_growth_has_a_fit_for_each_series(measured):
 def test_page_tables_and_trace_are_written(measured):
     page = (measured / "benchmark.html").read_text()
     assert page.count("<svg") == 1 + 7 and "scoring candidates" in page
-    tables = markdown_parts(benchmark_parts(measured / BENCHMARK))
+    tables = collected_text(benchmark_tables(measured / BENCHMARK))
     assert tables.startswith("`command` (") and tables.count("\n| --- |") == 2
     assert "one size only" in tables
     assert list((measured / "trace").rglob("*.xplane.pb"))

@@ -146,7 +146,8 @@ def test_the_gap_over_rounds_is_paired_and_leaves_the_initial_views_out(full_wor
     np.testing.assert_allclose([gap.mean, gap.half], [np.mean(by_hand), half])
     table = tables.rounds_table(runs, ["random", "farthest", "bavs"])
     assert table.head[1:3] == ("PSNR at 6 views (dB)", "PSNR at 8 views (dB)")
-    expected = f"{gap.mean:+.2f} ± {gap.half:.2f}".replace("-", "−")
+    p_value = scipy_stats.ttest_1samp(by_hand, 0.0).pvalue
+    expected = f"{gap.mean:+.2f} ± {gap.half:.2f} (p = {p_value:.2g})".replace("-", "−")
     assert table.rows[2][-1].text == expected
     assert stats.mean_round_gap(runs, "bavs", "oracle", "psnr") is None
 

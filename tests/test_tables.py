@@ -1,13 +1,40 @@
-"""The README's tables are those that the committed result files make."""
+"""Tables of result files in every format; the README's are those that the committed files make."""
 
+import csv
+import io
+import itertools
 import json
 import pathlib
 
+import numpy as np
+import pytest
+from scipy import stats as scipy_stats
+
 from experiments.posthoc.tables import cleanup_table, draws_table, geometry_table
-from experiments.report.tables import Cell, Table, markdown
-from experiments.tables import MARKED, fill_page
+from experiments.report import ReportError, stats
+from experiments.report.collected import collect_tables
+from experiments.report.formats import comma_separated, latex, markdown
+from experiments.report.printed import TABLES
+from experiments.report.tables import Cell, Table, interval_cell
+from experiments.sweeps.record import Record, write_record
+from experiments.tables import MARKED, fill_page, result_tables
+from tests.report_files import make_result, write_workdir
 
 ROOT = pathlib.Path(__file__).parents[1]
+POLICIES, SEEDS = ("random", "farthest", "bavs", "bavs_topk"), range(5)
+
+
+@pytest.fixture(scope="module")
+def workdir(tmp_path_factory):
+    results = [make_result(p, s) for p in POLICIES for s in SEEDS]
+    return write_workdir(tmp_path_factory.mktemp("runs"), results, arrays=False)
+
+
+def final_psnr(policy):
+    return np.array([make_result(policy, s)["rounds"][-1]["psnr"] for s in SEEDS])
+
+
+# --- formats ---
 
 
 def test_markdown_has_a_line_per_row_and_says_why_a_cell_is_empty():
@@ -21,10 +48,197 @@ def test_markdown_has_a_line_per_row_and_says_why_a_cell_is_empty():
     ]
 
 
+def test_csv_has_full_numbers_and_leaves_cells_empty_with_the_reason_at_the_end():
+    gap = stats.mean_interval([0.1, 0.25, 0.4])
+    rows = (
+        (Cell("bavs, ours"), interval_cell(gap, 2, "", gap=True)),
+        (Cell("random"), Cell("—", "no gap to itself")),
+    )
+    first, second = csv.DictReader(io.StringIO(comma_separated(Table(("policy", "gap"), rows))))
+    half = "gap, half of the 95 % interval"
+    p_value = "gap, p of the paired t-test"
+    assert first["policy"] == "bavs, ours" and first["why cells are empty"] == ""
+    numbers = [float(first[name]) for name in ("gap", half, p_value)]
+    assert numbers == [gap.mean, gap.half, stats.paired_p_value(gap)]
+    assert [second[n] for n in ("gap", half, p_value)] == ["", "", ""]
+    assert second["why cells are empty"] == "no gap to itself"
+
+
+def test_latex_gives_every_sign_its_own_meaning():
+    table = Table(("a_b", "50 %"), ((Cell("x & y"), Cell("−0.25 ± 0.1 (p < 0.001)")),))
+    assert latex(table).splitlines() == [
+        r"\begin{tabular}{lr}",
+        r"\toprule",
+        r"a\_b & 50 \% \\",
+        r"\midrule",
+        r"x \& y & $-$0.25 $\pm$ 0.1 (p $<$ 0.001) \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
+    assert latex(Table(("a",), ((Cell("—", "100 % missing"),),))).endswith(
+        "\n\n--- 100 \\% missing."
+    )
+
+
+@pytest.mark.parametrize("form", ["markdown", "csv", "latex"])
+def test_every_format_has_every_table(workdir, form):
+    text = result_tables(workdir, form=form)
+    for policy in POLICIES:
+        assert text.count(policy.replace("_", "\\_") if form == "latex" else policy) >= 3
+    only = result_tables(workdir, form=form, names=["time"])
+    assert "training" in only and "PSNR" not in only
+    with pytest.raises(ReportError, match="no table nothing; there are quality"):
+        result_tables(workdir, names=["nothing"])
+
+
+# --- the paired test ---
+
+
+def test_p_is_that_of_the_paired_t_test(workdir):
+    expected = scipy_stats.ttest_rel(final_psnr("bavs"), final_psnr("random")).pvalue
+    runs = collect_tables(workdir).tables["quality"].rows
+    cell = next(row for row in runs if row[0].text == "bavs")[-2]  # gaps to random and farthest
+    np.testing.assert_allclose(cell.p_value, expected, rtol=1e-9)  # the same formula in float64
+    assert f"(p = {expected:.2g})" in cell.text or "(p < 0.001)" in cell.text
+
+
+def test_p_is_below_5_percent_just_where_the_interval_excludes_zero():
+    rng = np.random.default_rng(0)
+    sides = set()
+    for _ in range(200):
+        gap = stats.mean_interval(rng.normal(0.8, 1.0, size=5))
+        excludes = not gap.low <= 0.0 <= gap.high
+        assert (stats.paired_p_value(gap) < 0.05) == excludes
+        sides.add(excludes)
+    assert sides == {True, False}
+
+
+def test_p_agrees_with_flipping_the_signs_of_many_seeds():
+    gaps = np.random.default_rng(1).normal(0.3, 1.0, size=14)
+    flips = np.array(list(itertools.product((-1, 1), repeat=14)))
+    by_flips = np.mean(np.abs(flips @ gaps) >= np.abs(gaps.sum()) - 1e-12)
+    # Gaps of 14 normal seeds: both tests ask the same, up to the shape of the tails.
+    np.testing.assert_allclose(stats.paired_p_value(stats.mean_interval(gaps)), by_flips, atol=0.02)
+
+
+def test_p_of_one_seed_and_of_equal_gaps():
+    assert stats.paired_p_value(stats.mean_interval([0.5])) is None
+    assert stats.paired_p_value(stats.mean_interval([0.5, 0.5])) == 0.0
+    assert stats.paired_p_value(stats.mean_interval([0.0, 0.0])) == 1.0
+
+
+# --- the paper beside ours ---
+
+
+def test_the_papers_rows_stand_beside_ours(workdir):
+    table = collect_tables(workdir, "table_1").tables["paper"]
+    rows = {row[0].text: dict(zip(table.head, row)) for row in table.rows}
+    assert [row[1].text for row in table.rows[:5]] == [row.name for row in TABLES["table_1"]]
+    assert rows["bavs"]["PSNR (dB)"].text.startswith(f"{final_psnr('bavs').mean():.2f} ± ")
+    texts = [cell.text for cell in table.rows[4]]
+    assert texts[3] == "29.02" and texts[-1] == "+1.88"  # 29.023 - 27.138, as a float
+    assert rows["activenerf"]["PSNR (dB)"].why == "activenerf: no completed run"
+    assert rows["farthest"]["in the paper"].why == "the paper prints no such number"
+
+
+def test_table_2_starts_from_the_initial_views(workdir):
+    table = collect_tables(workdir, "table_2").tables["paper"]
+    first = [make_result("random", s)["rounds"][0]["psnr"] for s in SEEDS]
+    assert table.rows[0][0].text == "initial views" and table.rows[0][1].text == "Origin"
+    np.testing.assert_allclose(table.rows[0][2].interval.mean, np.mean(first))
+
+
+def test_table_4_has_time_and_candidates(workdir):
+    table = collect_tables(workdir, "table_4").tables["paper"]
+    bavs = dict(zip(table.head, table.rows[1]))
+    # As report_files makes them: 4 rounds with 6 s of scoring and 0.02 s of selecting; 35 left.
+    np.testing.assert_allclose(bavs["scoring and selecting (s)"].interval.mean, 4 * 6.02)
+    assert bavs["candidates scored"].text == "35"
+    topk = dict(zip(table.head, table.rows[0]))
+    assert "not in its result files" in topk["candidates scored"].why
+    with pytest.raises(ReportError, match="table_9: no such table"):
+        collect_tables(workdir, "table_9")
+
+
+# --- sweeps ---
+
+
+def make_sweep(folder):
+    """Two settings: the second is 1 dB better, lacks a seed, and a third has nothing at all."""
+    rows = [
+        {"folder": f"L={n}", "values": {"L": n}, "policies": ["random", "bavs"], "seeds": [0, 1, 2]}
+        for n in (5, 6, 7)
+    ]
+    log = "L=6/bavs/seed_2/log.txt"
+    write_record(
+        folder,
+        Record("the command", rows, {"L=6/bavs/seed_2": f"failed: out of luck (log: {log})"}),
+    )
+    for n, seeds in ((5, (0, 1, 2)), (6, (0, 1))):
+        results = [make_result(p, s) for p in ("random", "bavs") for s in seeds]
+        for result in results if n == 6 else ():
+            result["rounds"][-1]["psnr"] += 1.0
+        write_workdir(folder / f"L={n}", results, arrays=False)
+    return folder
+
+
+def test_settings_are_compared_seed_by_seed(tmp_path):
+    table = collect_tables(make_sweep(tmp_path)).tables["settings"]
+    assert table.head[:4] == ("L", "policy", "seeds", "views")
+    assert table.head[-1] == "PSNR gap to L=5 (dB)"
+    rows = {(row[0].text, row[1].text): row for row in table.rows}
+    assert list(rows) == [(n, p) for n in "567" for p in ("random", "bavs")]
+    gap = rows["6", "bavs"][-1].interval
+    np.testing.assert_allclose([gap.mean, gap.half, gap.num], [1.0, 0.0, 2], atol=1e-9)
+    assert rows["5", "bavs"][-1].why == "a setting has no gap to itself"
+    assert rows["7", "bavs"][-1].why == "L=7, bavs: no completed run"
+
+
+def test_what_is_missing_of_a_sweep_says_why(tmp_path):
+    text = result_tables(make_sweep(tmp_path))
+    assert "the command" in text
+    assert "Missing: L=6, bavs, seed 2: failed: out of luck (log: L=6/bavs/seed_2/log.txt)." in text
+    assert "Missing: L=7, random, seed 0: not run yet." in text
+    assert "Missing: L=5" not in text
+
+
+def test_a_sweep_over_seeds_alone_reads_like_an_experiment(tmp_path):
+    write_workdir(tmp_path, [make_result("random", s) for s in (0, 1)], arrays=False)
+    row = {"folder": ".", "values": {}, "policies": ["random", "bavs"], "seeds": [0, 1]}
+    write_record(tmp_path, Record("swept", [row], {}))
+    found = collect_tables(tmp_path)
+    assert found.made.startswith("`swept`")
+    assert [row[0].text for row in found.tables["quality"].rows] == ["random", "bavs"]
+    assert found.notes == tuple(f"Missing: bavs, seed {s}: not run yet." for s in (0, 1))
+
+
+# --- pages ---
+
+
+def test_a_page_names_its_tables(workdir, tmp_path):
+    mark = f"<!-- results: {workdir} tables=paper paper=table_1 -->"
+    page = fill_page(f"a\n{mark}\nold\n<!-- end of results -->\nb", tmp_path)
+    assert "ActiveNeRF*" in page and "old" not in page and "training" not in page
+    assert page.startswith(f"a\n{mark}\n") and page.endswith("<!-- end of results -->\nb")
+    with pytest.raises(ReportError, match="colour="):
+        fill_page(f"<!-- results: {workdir} colour=red -->\n<!-- end of results -->", tmp_path)
+
+
 def test_readme_shows_what_the_result_files_say():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert MARKED.search(text), "README.md has no table of results"
     assert fill_page(text, ROOT) == text, "run python -m experiments.tables --page=README.md"
+
+
+def test_a_broken_record_is_one_line(tmp_path):
+    write_workdir(tmp_path, [make_result()], arrays=False)
+    (tmp_path / "sweep.json").write_text(json.dumps({"schema_version": 9}))
+    with pytest.raises(ValueError, match="schema_version is 9") as error:
+        collect_tables(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+# --- results of other scripts ---
 
 
 def cleaned_row(seed, *, before, after, floating):

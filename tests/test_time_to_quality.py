@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from experiments.bench.quality import first_seconds, parse_targets
-from experiments.bench.results import QUALITY, quality_parts
+from experiments.bench.results import QUALITY, quality_tables
 from experiments.errors import ConfigError
-from experiments.report.tables import markdown_parts
+from experiments.report.collected import collected_text
 from tests.toy_runs import toy_flags
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -49,7 +49,7 @@ def test_script_measures_with_a_cold_and_a_warm_cache(tmp_path):
     )
     assert any((tmp_path / "compiled").iterdir())
     assert not (tmp_path / "cold.json").exists()
-    assert "not reached" in markdown_parts(quality_parts(tmp_path / QUALITY))
+    assert "not reached" in collected_text(quality_tables(tmp_path / QUALITY))
     assert (tmp_path / "time_to_quality.html").read_text().count("<svg") == 1
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pathlib
 
+from experiments.report.collected import Collected
 from experiments.report.plots import seconds
 from experiments.report.tables import Cell, Table, dash
 
@@ -96,16 +97,17 @@ def facts(result: dict) -> list[str]:
     ]
 
 
-def benchmark_parts(path: pathlib.Path) -> list[str | Table]:
-    """What a benchmark found, in words and tables."""
+def benchmark_tables(path: pathlib.Path) -> Collected:
+    """What a benchmark found."""
     result = json.loads(path.read_text(encoding="utf-8"))
-    parts = [f"`{result['command']}` ({result['device']})", stage_table(result)]
-    parts.append(" ".join(facts(result)))
-    growth = growth_table(result)
-    return parts if growth is None else [*parts, growth]
+    tables = {"stages": stage_table(result)}
+    if (growth := growth_table(result)) is not None:
+        tables["growth"] = growth
+    return Collected(f"`{result['command']}` ({result['device']})", tables, tuple(facts(result)))
 
 
-def quality_parts(path: pathlib.Path) -> list[str | Table]:
-    """Time to quality, likewise."""
+def quality_tables(path: pathlib.Path) -> Collected:
+    """How long it took to each quality."""
     result = json.loads(path.read_text(encoding="utf-8"))
-    return [f"`{result['command']}` ({result['device']})", quality_table(result)]
+    made = f"`{result['command']}` ({result['device']})"
+    return Collected(made, {"time_to_quality": quality_table(result)})

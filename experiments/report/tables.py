@@ -17,6 +17,8 @@ class Cell:
 
     text: str
     why: str | None = None
+    interval: stats.Interval | None = None  # what the text rounds
+    p_value: float | None = None  # of a gap
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,20 +31,6 @@ class Table:
         """Why there are dashes, each reason once."""
         whys = [cell.why for row in self.rows for cell in row if cell.why]
         return tuple(dict.fromkeys(whys))
-
-
-def markdown(table: Table) -> str:
-    """A table as Markdown, with the reasons for its dashes below."""
-    rows = [table.head, ["---"] * len(table.head)]
-    rows += [[cell.text for cell in row] for row in table.rows]
-    lines = ["| " + " | ".join(row) + " |" for row in rows]
-    reasons = [f"\n— {'; '.join(table.reasons)}."] if table.reasons else []
-    return "\n".join([*lines, *reasons])
-
-
-def markdown_parts(parts: list[str | Table]) -> str:
-    """Words and tables one after another as Markdown."""
-    return "\n\n".join(p if isinstance(p, str) else markdown(p) for p in parts) + "\n"
 
 
 def dash(why: str) -> Cell:
@@ -64,11 +52,20 @@ def missing_measure(measure: stats.Measure, runs: list[Run]) -> str:
 
 
 def interval_cell(interval: stats.Interval | None, digits: int, why: str, *, gap=False) -> Cell:
-    """`mean ± half`, without the half where there is one seed."""
+    """`mean ± half`, without the half where there is one seed; of a gap also how sure it is."""
     if interval is None:
         return dash(why)
     mean = signed(interval.mean, digits) if gap else f"{interval.mean:.{digits}f}"
-    return Cell(mean if interval.half is None else f"{mean} ± {interval.half:.{digits}f}")
+    text = mean if interval.half is None else f"{mean} ± {interval.half:.{digits}f}"
+    p_value = stats.paired_p_value(interval) if gap else None
+    if p_value is not None:
+        text += f" ({p_words(p_value)})"
+    return Cell(text, interval=interval, p_value=p_value)
+
+
+def p_words(p_value: float) -> str:
+    """A p-value, as exactly as it matters."""
+    return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.2g}"
 
 
 def final_table(runs: list[Run], policies: list[str]) -> Table:

@@ -1,0 +1,149 @@
+"""All that the result files of a folder say, as named tables."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+
+from experiments.report.formats import FORMATS, latex_text
+from experiments.report.paper_table import paper_table
+from experiments.report.results import ReportError, Run, load_runs
+from experiments.report.settings_table import Setting, settings_table
+from experiments.report.tables import (
+    Table,
+    baseline_table,
+    final_table,
+    rounds_table,
+    timing_table,
+)
+from experiments.sweeps.record import FILE as SWEEP_FILE
+from experiments.sweeps.record import Record, read_record
+
+RUN_TABLES = {
+    "quality": final_table,
+    "rounds": rounds_table,
+    "baselines": baseline_table,
+    "time": timing_table,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Collected:
+    """What stands above the tables, the tables by name, and what stands below."""
+
+    made: str  # by which command, on what
+    tables: dict[str, Table]
+    notes: tuple[str, ...] = ()  # what is missing, and why
+
+
+# What is no table, as a line of each format.
+AS_TEXT = {"markdown": str, "csv": lambda text: f"# {text}", "latex": lambda text: f"% {text}"}
+
+
+def collected_text(
+    found: Collected, *, form: str = "markdown", names: list[str] | None = None
+) -> str:
+    """What was made, the tables and the notes.
+
+    Args:
+      found: what to show.
+      form: a key of `FORMATS`.
+      names: of the tables; None: all.
+
+    Raises:
+      ReportError: no such table.
+    """
+    unknown = [name for name in names or () if name not in found.tables]
+    if unknown:
+        raise ReportError(f"tables: there is no {unknown[0]}; there are {', '.join(found.tables)}")
+    as_text = AS_TEXT[form]
+    blocks = [as_text(found.made)]
+    for name in names or list(found.tables):
+        title = [] if form == "markdown" else [as_text(name)]
+        blocks.append("\n".join([*title, FORMATS[form](found.tables[name])]))
+    blocks += [latex_text(n) if form == "latex" else as_text(n) for n in found.notes]
+    return "\n\n".join(blocks) + "\n"
+
+
+def run_tables(folder: pathlib.Path, paper: str | None = None) -> Collected:
+    """Quality at the last shared number of views, round by round, and where the time went.
+
+    Args:
+      folder: of one experiment, with its `summary.json`.
+      paper: a table of the paper whose rows are put beside ours; see `printed.TABLES`.
+
+    Raises:
+      ReportError: a file that cannot be used.
+    """
+    runs, record = load_runs(folder), read_record(folder)
+    policies = list(dict.fromkeys(run.policy for run in runs))
+    notes: tuple[str, ...] = ()
+    if record is not None:
+        policies = list(dict.fromkeys([*policies, *_setting_row(record, ".")["policies"]]))
+        notes = _missing_notes(record, {".": runs})
+    if not runs:
+        raise ReportError(f"{folder / 'summary.json'}: holds no run; wait for the first to end")
+    made = {name: make(runs, policies) for name, make in RUN_TABLES.items()}
+    if paper is not None:
+        made["paper"] = paper_table(runs, policies, paper)
+    tables = {name: table for name, table in made.items() if table is not None}
+    return Collected(_made_words(record, runs), tables, notes)
+
+
+def sweep_tables(folder: pathlib.Path) -> Collected:
+    """The settings of a sweep against each other.
+
+    Raises:
+      ReportError: a file that cannot be used, or no result so far.
+    """
+    record = read_record(folder)
+    runs = {row["folder"]: _runs_so_far(folder / row["folder"]) for row in record.settings}
+    settings = [
+        Setting(row["folder"], row["values"], row["policies"], runs[row["folder"]])
+        for row in record.settings
+    ]
+    done = [run for some in runs.values() for run in some]
+    if not done:
+        raise ReportError(f"{folder / SWEEP_FILE}: no trial has a result so far")
+    notes = _missing_notes(record, runs)
+    return Collected(_made_words(record, done), {"settings": settings_table(settings)}, notes)
+
+
+def collect_tables(folder: pathlib.Path, paper: str | None = None) -> Collected:
+    """The tables of whatever a folder holds: of a sweep over options, or of one experiment."""
+    record = read_record(folder)
+    if record is not None and any(row["values"] for row in record.settings):
+        return sweep_tables(folder)
+    return run_tables(folder, paper)
+
+
+def _runs_so_far(folder: pathlib.Path) -> list[Run]:
+    return load_runs(folder) if (folder / "summary.json").exists() else []
+
+
+def _setting_row(record: Record, folder: str) -> dict:
+    return next(row for row in record.settings if row["folder"] == folder)
+
+
+def _made_words(record: Record | None, runs: list[Run]) -> str:
+    commands = list(dict.fromkeys(run.result["command"] for run in runs))
+    command = common_command(commands) if record is None else record.command
+    devices = ", ".join(dict.fromkeys(run.result["device"] for run in runs))
+    return f"`{command}` ({devices}; means over seeds ± half of the 95 % interval)"
+
+
+def common_command(commands: list[str]) -> str:
+    """What all commands share: runs that were made in parts are those of one command."""
+    words = [command.split() for command in commands]
+    return " ".join(word for word in words[0] if all(word in others for others in words))
+
+
+def _missing_notes(record: Record, runs: dict[str, list[Run]]) -> tuple[str, ...]:
+    """Every run that was planned and has no result."""
+    notes = []
+    for folder, some in runs.items():
+        done = {(run.policy, run.seed) for run in some if run.completed}
+        where = "" if folder == "." else f"{folder}, "
+        missing = record.missing(folder, done)
+        notes += [f"Missing: {where}{p}, seed {s}: {why}." for (p, s), why in missing.items()]
+    return tuple(notes)

@@ -1,0 +1,88 @@
+"""A sweep over options as one table: each setting against random choice and against the first."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+from experiments.report import stats
+from experiments.report.results import Run
+from experiments.report.tables import Cell, Table, dash, interval_cell, missing_measure
+
+REFERENCE = "random"
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """The runs of one combination of options."""
+
+    name: str
+    values: dict[str, Any]
+    policies: list[str]
+    runs: list[Run]  # empty where there is no result yet
+
+
+def settings_table(settings: list[Setting]) -> Table:
+    """Means over seeds at the end of each setting, with gaps paired by seed."""
+    options = list(dict.fromkeys(option for s in settings for option in s.values))
+    measures = [m for m in stats.MEASURES if any(_has(s.runs, m.key) for s in settings)]
+    compared = any(REFERENCE in s.policies and len(s.policies) > 1 for s in settings)
+    head = [*options, "policy", "seeds", "views"]
+    head += [f"{m.label} ({m.unit})" if m.unit else m.label for m in measures]
+    head += [f"PSNR gap to {REFERENCE} (dB)"] * compared
+    head += [f"PSNR gap to {settings[0].name} (dB)"]
+    rows = []
+    for setting in settings:
+        fixed = [
+            Cell(str(setting.values[o])) if o in setting.values else dash(f"{o}: not set")
+            for o in options
+        ]
+        for policy in setting.policies:
+            cells = _row(setting, policy, measures, settings[0], compared)
+            rows.append((*fixed, Cell(policy), *cells))
+    return Table(tuple(head), tuple(rows))
+
+
+def _row(setting: Setting, policy: str, measures, first: Setting, compared: bool) -> list[Cell]:
+    mine = stats.completed(setting.runs, policy)
+    num_views = stats.common_num_views(setting.runs)
+    seeds = Cell(str(len(mine)))
+    if not mine:
+        empty = dash(f"{setting.name}, {policy}: no completed run")
+        return [seeds, *[empty] * (len(measures) + compared + 2)]
+    cells = [seeds, Cell(str(num_views)) if num_views is not None else dash("no shared number")]
+    for measure in measures:
+        interval = stats.over_seeds(setting.runs, policy, measure.key, num_views)
+        cells.append(interval_cell(interval, measure.digits, missing_measure(measure, mine)))
+    if compared:
+        cells.append(_reference_gap(setting, policy, num_views))
+    cells.append(_setting_gap(setting, first, policy, num_views))
+    return cells
+
+
+def _reference_gap(setting: Setting, policy: str, num_views) -> Cell:
+    if policy == REFERENCE:
+        return dash("a policy has no gap to itself")
+    pair = stats.compare(setting.runs, policy, REFERENCE, "psnr", num_views)
+    why = f"{setting.name}: {policy} and {REFERENCE} share no seed"
+    return interval_cell(pair.gap if pair else None, 2, why, gap=True)
+
+
+def _setting_gap(setting: Setting, first: Setting, policy: str, num_views) -> Cell:
+    """Each at its own last number of views: an option may change how many there are."""
+    if setting is first:
+        return dash("a setting has no gap to itself")
+    ours = _by_seed(setting.runs, policy, num_views)
+    theirs = _by_seed(first.runs, policy, stats.common_num_views(first.runs))
+    gaps = [value - theirs[seed] for seed, value in ours.items() if seed in theirs]
+    why = f"{policy}: {setting.name} and {first.name} share no seed"
+    return interval_cell(stats.mean_interval(gaps), 2, why, gap=True)
+
+
+def _by_seed(runs: list[Run], policy: str, num_views) -> dict[int, float]:
+    values = {r.seed: r.value("psnr", num_views) for r in stats.completed(runs, policy)}
+    return {seed: value for seed, value in values.items() if value is not None}
+
+
+def _has(runs: list[Run], measure: str) -> bool:
+    return any(r.get(measure) is not None for run in runs for r in run.rounds)
