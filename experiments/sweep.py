@@ -103,7 +103,7 @@ def sweep(config, folder: pathlib.Path, given: list[str]) -> int:
     trials = [t for s in settings for t in make_trials(s, given, cache=FLAGS.compilation_cache)]
     planned = sum(part.policy is not None for s in settings for part in s.parts)
     left = sum(trial.part.policy is not None for trial in trials)
-    print(f"{planned} trials, {planned - left} of them finished before", flush=True)
+    print(f"trials: {planned}, finished before: {planned - left}", flush=True)
     failed = (
         run_trials(trials, make_engine(), record, folder, retries=FLAGS.retries) if trials else 0
     )

@@ -74,7 +74,7 @@ def test_a_finished_sweep_runs_nothing_again(disturbed, cache):
     work, *_ = disturbed
     before = (work / "random" / "seed_0" / "result.json").stat().st_mtime_ns
     code, out = end_of(start_sweep([*FLAGS, f"--workdir={work}"], cache))
-    assert code == 0 and "2 trials, 2 of them finished before" in out
+    assert code == 0 and "trials: 2, finished before: 2" in out
     assert (work / "random" / "seed_0" / "result.json").stat().st_mtime_ns == before
     assert attempts(work / "farthest" / "seed_0") == 1
 
