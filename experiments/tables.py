@@ -56,6 +56,10 @@ def result_tables(
       ReportError: a file that cannot be used, or no such table.
     """
     found = collect_all(folder, paper)
+    known = list(dict.fromkeys(name for one in found for name in one.tables))
+    unknown = [name for name in names or () if name not in known]
+    if unknown:
+        raise ReportError(f"{folder}: no table {unknown[0]}; there are {', '.join(known)}")
     return "\n".join(collected_text(one, form=form, names=names) for one in found)
 
 

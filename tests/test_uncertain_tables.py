@@ -91,7 +91,7 @@ def test_table_of_a_variant_is_paired_by_seed():
     assert "depth_mae_pooled" in known_variants(rows) and len(known_variants(rows)) == 4
     table = ause_table(rows, "depth_mae_pooled")
     cells = {row[0].text: row for row in table.rows}
-    assert cells["entropy"][-1].text == "+0.300 ± 0.000"
+    assert cells["entropy"][-1].text == "+0.300 ± 0.000 (p < 0.001)"
     assert cells["laplace"][-1].text == "—" and cells["cf_nerf"][-1].why.endswith("share no seed")
     assert cells["laplace"][2].text == "20.50 ± 6.35"  # 12.706 / sqrt(2) * sqrt(0.5)
 
@@ -101,10 +101,10 @@ def test_summary_has_a_row_for_each_model_and_field():
     assert len(table.rows) == 6 and len(table.head) == 10
     own, common = cells_of(Table(table.head, table.rows[:3])), table.rows[3:]
     assert own["entropy"]["AUSE depth MAE"] == "0.400 ± 0.000"
-    assert own["entropy"]["depth: minus laplace"] == "+0.200 ± 0.000"
+    assert own["entropy"]["depth: minus laplace"] == "+0.200 ± 0.000 (p < 0.001)"
     assert own["cf_nerf"]["PSNR of the field (dB)"] == "27.00"
     assert [row[1].text for row in common] == ["common field"] * 3
-    assert common[1][3].text == "22.00 ± 0.00" and common[1][5].text == "+0.300 ± 0.000"
+    assert common[1][3].text == "22.00 ± 0.00" and common[1][5].text == "+0.300 ± 0.000 (p < 0.001)"
 
 
 def test_summary_without_depth_says_why():

@@ -48,17 +48,11 @@ def collected_text(
     Args:
       found: what to show.
       form: a key of `FORMATS`.
-      names: of the tables; None: all.
-
-    Raises:
-      ReportError: no such table.
+      names: of the tables, those that there are; None: all.
     """
-    unknown = [name for name in names or () if name not in found.tables]
-    if unknown:
-        raise ReportError(f"tables: there is no {unknown[0]}; there are {', '.join(found.tables)}")
     as_text = AS_TEXT[form]
     blocks = [as_text(found.made)]
-    for name in names or list(found.tables):
+    for name in [name for name in names or found.tables if name in found.tables]:
         title = [] if form == "markdown" else [as_text(name)]
         blocks.append("\n".join([*title, FORMATS[form](found.tables[name])]))
     blocks += [latex_text(n) if form == "latex" else as_text(n) for n in found.notes]
