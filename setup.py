@@ -17,12 +17,7 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.11",
     packages=find_packages(include=["bavs_jax", "bavs_jax.*", "experiments", "experiments.*"]),
-    package_data={
-        "experiments.bench": ["template.html"],
-        "experiments.report": ["template.html"],
-        "experiments.suggest": ["template.html"],
-        "experiments.uncertain": ["template.html"],
-    },
+    package_data={"experiments": ["*/template.html"]},
     install_requires=[
         "absl-py>=2.1",
         "flax>=0.12",
