@@ -224,10 +224,15 @@ def test_a_page_names_its_tables(workdir, tmp_path):
         fill_page(f"<!-- results: {workdir} colour=red -->\n<!-- end of results -->", tmp_path)
 
 
-def test_readme_shows_what_the_result_files_say():
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert MARKED.search(text), "README.md has no table of results"
-    assert fill_page(text, ROOT) == text, "run python -m experiments.tables --page=README.md"
+@pytest.mark.parametrize(
+    "page", ["README.md", "experiments/results/README.md", "experiments/results/TRIES.md"]
+)
+def test_pages_show_what_the_result_files_say(page):
+    path = ROOT / page
+    text = path.read_text(encoding="utf-8")
+    assert MARKED.search(text), f"{page} has no table of results"
+    filled = fill_page(text, path.parent)
+    assert filled == text, f"run python -m experiments.tables --page={page}"
 
 
 def test_a_broken_record_is_one_line(tmp_path):
