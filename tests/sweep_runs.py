@@ -1,7 +1,6 @@
 """Helpers for tests that start the sweep script and interfere with its processes."""
 
 import json
-import os
 import pathlib
 import subprocess
 import sys
@@ -11,12 +10,11 @@ from collections import Counter
 ROOT = pathlib.Path(__file__).parents[1]
 
 
-def start_sweep(flags, cache):
-    """The script, as a process of its own; `cache` keeps compiled programs."""
+def start_sweep(flags):
+    """The script, as a process of its own."""
     return subprocess.Popen(
         [sys.executable, "-m", "experiments.sweep", *flags],
         cwd=ROOT,
-        env=os.environ | {"XDG_CACHE_HOME": str(cache)},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

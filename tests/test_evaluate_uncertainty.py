@@ -1,7 +1,6 @@
 """Uncertainty against error: errors of pixels, tables, and the script on a toy run."""
 
 import json
-import os
 import pathlib
 import subprocess
 import sys
@@ -120,7 +119,6 @@ def start(base, *, models):
     return subprocess.Popen(
         [sys.executable, "-m", "experiments.evaluate_uncertainty", f"--workdir={base}", *flags],
         cwd=ROOT,
-        env=os.environ | {"XDG_CACHE_HOME": str(base)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -27,9 +27,9 @@ POLICY = "random"
 OVERRIDES = {"policies": (POLICY,), "num_rounds": 1}
 
 
-def script(name, *flags, cache):
-    """Runs a script to its end; `cache` keeps compiled programs between the tests."""
-    env = os.environ | {"XDG_CACHE_HOME": str(cache), "JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
+def script(name, *flags):
+    """Runs a script to its end."""
+    env = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
     return subprocess.run(
         [sys.executable, "-m", f"experiments.{name}", *flags],
         cwd=ROOT,
@@ -45,17 +45,17 @@ def cleaned(tmp_path_factory):
     """A folder that `clean_up` has filled from nothing, and what it printed."""
     folder = tmp_path_factory.mktemp("posthoc")
     flags = (f"--workdir={folder}", "--num_test=3", "--num_thresholds=6")
-    done = script("clean_up", *toy_flags(**OVERRIDES), *flags, cache=folder / "cache")
+    done = script("clean_up", *toy_flags(**OVERRIDES), *flags)
     assert done.returncode == 0, done.stderr
     return folder, done.stdout
 
 
 @pytest.fixture(scope="module")
-def run(cleaned):
+def run(cleaned, cache):
     """The same, taken up in this process."""
     folder, _ = cleaned
     config = saved_config(folder)
-    scene = load_config_scene(config, cache_dir=str(folder / "cache" / "bavs_jax" / "scenes"))
+    scene = load_config_scene(config, cache_dir=str(cache / "bavs_jax" / "scenes"))
     problem = build_problem(config, scene, field_kind(POLICY))
     return load_run(config, problem, folder, POLICY, 0)
 
@@ -90,7 +90,7 @@ def test_clean_up_trains_measures_and_writes(cleaned):
 def test_posterior_draws_takes_up_the_run(cleaned):
     folder, _ = cleaned
     flags = (f"--workdir={folder}", "--num_draws=2", "--num_views=2")
-    done = script("posterior_draws", *flags, cache=folder / "cache")
+    done = script("posterior_draws", *flags)
     assert done.returncode == 0, done.stderr
     assert "train on" not in done.stdout
     assert "training views:" in done.stdout and "test views:" in done.stdout
@@ -110,9 +110,7 @@ def read_vertices(path):
 def test_exported_files_agree_with_the_field(cleaned, run):
     base, _ = cleaned
     flags = ("--resolution=9", "--num_samples=300", "--density_threshold=0.5")
-    done = script(
-        "export_field", f"--workdir={base}", *flags, "--min_opacity=0.01", cache=base / "cache"
-    )
+    done = script("export_field", f"--workdir={base}", *flags, "--min_opacity=0.01")
     assert done.returncode == 0, done.stderr
     folder = run.folder / "export"
     names = {"grid.npz", "slices.png", "density.nrrd", "sigma.nrrd", "uncertainty.nrrd"}
@@ -191,6 +189,6 @@ def test_configs_that_cannot_be_used_are_errors(tmp_path):
     ],
 )
 def test_wrong_flags_end_in_one_line(tmp_path, name, flag, message):
-    done = script(name, f"--workdir={tmp_path}", flag, cache=tmp_path)
+    done = script(name, f"--workdir={tmp_path}", flag)
     assert done.returncode != 0 and "Traceback" not in done.stderr
     assert done.stderr.startswith("error: ") and message in done.stderr

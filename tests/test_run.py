@@ -1,7 +1,6 @@
 """The script as a user runs it: results, resumption after a real kill, errors, exported poses."""
 
 import json
-import os
 import pathlib
 import signal
 import subprocess
@@ -18,25 +17,19 @@ ROOT = pathlib.Path(__file__).parents[1]
 SCRIPT = [sys.executable, "-m", "experiments.active_selection"]
 
 
-def script(*flags, cache, **kwargs):
-    """Runs the script to its end; `cache` keeps compiled programs between the tests."""
-    env = os.environ | {"XDG_CACHE_HOME": str(cache)}
+def script(*flags, **kwargs):
+    """Runs the script to its end."""
     return subprocess.run(
-        [*SCRIPT, *flags], cwd=ROOT, env=env, capture_output=True, text=True, timeout=300, **kwargs
+        [*SCRIPT, *flags], cwd=ROOT, capture_output=True, text=True, timeout=300, **kwargs
     )
 
 
 @pytest.fixture(scope="session")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
-
-
-@pytest.fixture(scope="session")
-def finished(cache, tmp_path_factory):
+def finished(tmp_path_factory):
     """A run of two policies to its end."""
     folder = tmp_path_factory.mktemp("finished")
     flags = toy_flags(policies="('bavs','random')")
-    done = script(f"--workdir={folder}", *flags, cache=cache)
+    done = script(f"--workdir={folder}", *flags)
     assert done.returncode == 0, done.stderr
     return folder, done.stdout
 
@@ -92,21 +85,20 @@ def test_next_views_are_the_chosen_poses_in_nerfstudio_format(finished):
         assert frame["fl_x"] > 0 and frame["w"] == 16
 
 
-def test_starting_a_finished_run_again_changes_nothing(finished, cache):
+def test_starting_a_finished_run_again_changes_nothing(finished):
     folder, _ = finished
     before = (folder / "bavs" / "seed_0" / "result.json").read_bytes()
-    done = script(f"--workdir={folder}", *toy_flags(policies="('bavs','random')"), cache=cache)
+    done = script(f"--workdir={folder}", *toy_flags(policies="('bavs','random')"))
     assert done.returncode == 0, done.stderr
     assert (folder / "bavs" / "seed_0" / "result.json").read_bytes() == before
 
 
 @pytest.mark.parametrize("kill_at", [9, 13, 17])
-def test_killed_run_goes_on_and_ends_like_the_undisturbed_one(finished, cache, tmp_path, kill_at):
+def test_killed_run_goes_on_and_ends_like_the_undisturbed_one(finished, tmp_path, kill_at):
     """SIGKILL after a number of log lines, in different rounds; then the same command again."""
     flags = [f"--workdir={tmp_path}", *toy_flags(policies="('bavs',)")]
-    env = os.environ | {"XDG_CACHE_HOME": str(cache)}
     process = subprocess.Popen(
-        [*SCRIPT, *flags], cwd=ROOT, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [*SCRIPT, *flags], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     checkpoints, deadline = tmp_path / "bavs" / "seed_0" / "checkpoints", time.monotonic() + 200
     while time.monotonic() < deadline and process.poll() is None:
@@ -117,7 +109,7 @@ def test_killed_run_goes_on_and_ends_like_the_undisturbed_one(finished, cache, t
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not (tmp_path / "report.html").exists(), "the run had ended before it was killed"
-    done = script(*flags, cache=cache)
+    done = script(*flags)
     assert done.returncode == 0, done.stderr
     got, want = load(tmp_path)["rounds"], load(finished[0])["rounds"]
     for a, b in zip(got, want, strict=True):
@@ -125,8 +117,8 @@ def test_killed_run_goes_on_and_ends_like_the_undisturbed_one(finished, cache, t
         np.testing.assert_allclose(a["psnr"], b["psnr"], atol=1e-3)
 
 
-def test_list_policies_prints_one_a_line(cache):
-    done = script("--list_policies", cache=cache)
+def test_list_policies_prints_one_a_line():
+    done = script("--list_policies")
     lines = done.stdout.splitlines()
     assert [line.split(maxsplit=1) for line in lines] == [
         [n, p.summary] for n, p in POLICIES.items()
@@ -144,19 +136,18 @@ def test_list_policies_prints_one_a_line(cache):
         (["--config.no_such_option=1"], "no_such_option"),
     ],
 )
-def test_wrong_options_end_in_one_line(cache, tmp_path, flags, message):
+def test_wrong_options_end_in_one_line(tmp_path, flags, message):
     env_flags = [f"--workdir={tmp_path}", *toy_flags(), *flags]
-    done = script(*env_flags, cache=cache)
+    done = script(*env_flags)
     assert done.returncode != 0
     assert message in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_another_config_in_the_same_folder_is_refused(finished, cache):
+def test_another_config_in_the_same_folder_is_refused(finished):
     done = script(
         f"--workdir={finished[0]}",
         *toy_flags(policies="('bavs',)", train__num_steps=28),
-        cache=cache,
     )
     assert done.returncode != 0 and "train.num_steps" in done.stderr
     assert "Traceback" not in done.stderr

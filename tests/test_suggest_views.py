@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import json
 import math
-import os
 import pathlib
 import subprocess
 import sys
@@ -247,12 +246,11 @@ SMALL = {
 }  # fmt: skip
 
 
-def script(*flags, cache):
+def script(*flags):
     small = [f"--config.{name}={value}" for name, value in SMALL.items()]
     return subprocess.run(
         [sys.executable, "-m", "experiments.suggest_views", *small, *flags],
         cwd=ROOT,
-        env=os.environ | {"XDG_CACHE_HOME": str(cache)},
         capture_output=True,
         text=True,
         timeout=300,
@@ -267,7 +265,7 @@ def finished(tmp_path_factory):
     flags = [f"--data={data}", f"--workdir={base / 'out'}", "--image_size=24", "--train_steps=16"]
     flags += ["--num_views=3", "--num_candidates=12", "--score_scale=0.5"]
     flags += ["--config.field.num_levels=2", "--config.proposal.num_levels=1"]
-    done = script(*flags, "--route", "--start=4,0,1", "--holdout=2", cache=base)
+    done = script(*flags, "--route", "--start=4,0,1", "--holdout=2")
     assert done.returncode == 0, done.stderr
     return base, flags, done.stdout
 
@@ -303,7 +301,7 @@ def test_script_writes_poses_that_agree_with_each_other(finished):
 def test_same_folder_uses_the_same_field_for_other_candidates_and_policies(finished):
     base, flags, _ = finished
     box = ["--candidates=box", "--bounds=-6,-6,0.5,6,6,5"]
-    done = script(*flags, "--holdout=2", *box, "--policy=directional", cache=base)
+    done = script(*flags, "--holdout=2", *box, "--policy=directional")
     assert done.returncode == 0, done.stderr
     assert "train on" not in done.stdout.replace("photos to train on", "")
     frames = json.loads((base / "out/next_views/transforms.json").read_text())["frames"]
@@ -312,8 +310,8 @@ def test_same_folder_uses_the_same_field_for_other_candidates_and_policies(finis
 
 
 def test_wrong_folder_ends_in_one_line(finished, tmp_path):
-    base, usual, _ = finished
-    done = script(*usual, f"--workdir={tmp_path}", "--data=/nowhere", cache=base)
+    _, usual, _ = finished
+    done = script(*usual, f"--workdir={tmp_path}", "--data=/nowhere")
     assert done.returncode != 0 and "/nowhere" in done.stderr
     assert "Traceback" not in done.stderr
 

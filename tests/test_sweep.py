@@ -28,22 +28,17 @@ FLAGS = toy_flags(num_rounds=1, policies="('random','farthest')")
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
-
-
-@pytest.fixture(scope="module")
-def disturbed(cache, tmp_path_factory):
+def disturbed(tmp_path_factory):
     """A sweep that was stopped with ctrl-C, started again, and lost a worker on the way."""
     work = tmp_path_factory.mktemp("sweep")
     flags = [*FLAGS, "--jobs=2", f"--workdir={work}"]
-    process = start_sweep(flags, cache)
+    process = start_sweep(flags)
     wait_until(lambda: last_checkpoint(work / "initial" / "seed_0") >= 2, process)
     process.send_signal(signal.SIGINT)
     stopped = end_of(process)
     left = processes_with(str(work))
 
-    process = start_sweep(flags, cache)
+    process = start_sweep(flags)
     wait_until(lambda: last_checkpoint(work / "random" / "seed_0") >= 10, process)
     for pid in processes_with(f"--workdir={work} --part=random/seed_0"):
         os.kill(pid, signal.SIGKILL)
@@ -70,21 +65,21 @@ def test_nothing_is_lost_or_run_twice(disturbed):
     assert (work / "report.html").exists() and (work / "next_views" / "transforms.json").exists()
 
 
-def test_a_finished_sweep_runs_nothing_again(disturbed, cache):
+def test_a_finished_sweep_runs_nothing_again(disturbed):
     work, *_ = disturbed
     before = (work / "random" / "seed_0" / "result.json").stat().st_mtime_ns
-    code, out = end_of(start_sweep([*FLAGS, f"--workdir={work}"], cache))
+    code, out = end_of(start_sweep([*FLAGS, f"--workdir={work}"]))
     assert code == 0 and "trials: 2, finished before: 2" in out
     assert (work / "random" / "seed_0" / "result.json").stat().st_mtime_ns == before
     assert attempts(work / "farthest" / "seed_0") == 1
 
 
 @pytest.fixture(scope="module")
-def half_failed(cache, tmp_path_factory):
+def half_failed(tmp_path_factory):
     """A sweep over a setting that cannot be run and one that can, which nothing disturbs."""
     work = tmp_path_factory.mktemp("half")
     flags = [*FLAGS, "--axis=policy=random", "--axis=config.num_initial=1000,2", "--jobs=1"]
-    return work, end_of(start_sweep([*flags, f"--workdir={work}"], cache))
+    return work, end_of(start_sweep([*flags, f"--workdir={work}"]))
 
 
 def test_a_setting_that_fails_does_not_stop_the_others(half_failed):

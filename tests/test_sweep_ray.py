@@ -35,7 +35,7 @@ def test_nothing_is_lost_or_run_twice_when_a_node_is_killed(cluster, tmp_path):
     work = tmp_path / "work"
     flags = toy_flags(num_rounds=1, train__num_steps=120, policies="('random',)")
     flags += ["--axis=seed=0:2", "--engine=ray", f"--ray_address={cluster.address}"]
-    process = start_sweep([*flags, f"--workdir={work}"], tmp_path / "cache")
+    process = start_sweep([*flags, f"--workdir={work}"])
 
     def at_work():
         """Round 0 of these seeds is half made."""
