@@ -28,6 +28,7 @@ from experiments.posthoc.draws import (
     spread_measures,
 )
 from experiments.posthoc.figures import Panel, panel_table, save_png
+from experiments.posthoc.tables import SPLITS
 from experiments.trained import TrainedRun
 
 NUM_SHOWN = 3  # draws in the picture
@@ -39,7 +40,12 @@ flags.DEFINE_integer("num_views", 8, "Training views, and as many test views, th
 flags.DEFINE_float(
     "scale", 0.0, "Temperature of the draws; 0: what the training views' error says of the noise."
 )
-flags.DEFINE_float("limit", 0.1, "Largest offset, as a share of the sides of the scene box.")
+flags.DEFINE_float(
+    "limit",
+    1.0,
+    "Largest offset, in cells of the deformation grid. The posterior is that of small offsets: a "
+    "vertex in empty space has no curvature, but far offsets would bring matter there.",
+)
 
 
 def draw_all() -> None:
@@ -49,13 +55,13 @@ def draw_all() -> None:
         ("num_draws", FLAGS.num_draws >= 2, "give 2 or more"),
         ("num_views", FLAGS.num_views >= 1, "give 1 or more"),
         ("scale", FLAGS.scale >= 0.0, "give a number above 0, or 0 for the noise's own"),
-        ("limit", 0.0 < FLAGS.limit <= 1.0, "give a share above 0 and up to 1"),
+        ("limit", FLAGS.limit > 0.0, "give a number above 0"),
     )
     rows = []
     for run in script.trained_runs():
         rows.append(draw_run(run))
-        for name in ("training", "test"):
-            print(f"{name} views: {_in_words(rows[-1][name])}")
+        for name, words in SPLITS.items():
+            print(f"{words}: {_in_words(rows[-1][name])}")
         # Written after each run, so that a command that is stopped leaves what it has measured.
         write_json(pathlib.Path(FLAGS.workdir) / "draws.json", script.result_file(run, rows))
     print(f"numbers:  {pathlib.Path(FLAGS.workdir) / 'draws.json'}")
@@ -74,10 +80,11 @@ def draw_run(run: TrainedRun) -> dict:
         np.concatenate([seen, held_out]),
         num_draws=FLAGS.num_draws,
         scale=FLAGS.scale or None,
-        limit=largest_offset(run, FLAGS.limit),
+        limit=largest_offset(run.toolbox.grid, FLAGS.limit),
     )
     split = {"training": views[: len(seen)], "test": views[len(seen) :]}
-    shown = [split["training"][0], next(v for v in split["test"] if v.view_id == far)]
+    split["farthest"] = [view for view in split["test"] if view.view_id == far]
+    shown = [split["training"][0], *split["farthest"]]
     path = run.folder / "draws" / "draws.png"
     save_png(draws_figure(run, shown), path)
     print(f"picture:  {path}")

@@ -197,7 +197,7 @@ def spread_of_side():
     prior_weight = default_prior_weight(3)
     precision = posterior_precision(raw_sum(rays), num_rays=num_rays, prior_weight=prior_weight)
     scale = noise_scale(noise**2, num_rays)
-    thetas = draw_offsets(KEY, precision, 12, scale=scale, limit=0.2)
+    thetas = draw_offsets(KEY, precision, 12, scale=scale, limit=0.25)
     render = make_displaced_render_fn(BALL, SAMPLER, grid, **OPTIONS)
 
     def spread(side):
@@ -220,12 +220,9 @@ def test_what_was_photographed_stays_and_the_far_side_moves(spread_of_side):
 
 def test_farthest_view_and_largest_offset():
     scene = toy_scene()  # 12 views on a ring
-    is_training_view = np.arange(12) < 4
     state = SimpleNamespace(table=SimpleNamespace(cameras=scene.cameras))
-    run = SimpleNamespace(
-        state=state,
-        training_views=np.flatnonzero(is_training_view),
-        problem=SimpleNamespace(scene=scene),
-    )
+    run = SimpleNamespace(state=state, training_views=np.arange(4))
     assert farthest_view(run, np.arange(4, 12)) in (7, 8)  # opposite to the views 0 .. 3
-    np.testing.assert_allclose(largest_offset(run, 0.1), 0.2)
+    # Four cells along a side of 2; in contracted space the box is the middle half of the grid.
+    np.testing.assert_allclose(largest_offset(GRID, 0.5), 0.25)
+    np.testing.assert_allclose(largest_offset(GRID.replace(contracted=True), 0.5), 0.5)

@@ -284,8 +284,9 @@ def test_measures_that_no_pixel_has_are_dashes_with_a_reason():
 
 def test_tables_of_draws_and_geometry():
     spread = {"spread": 0.01, "spread_all": 0.005, "rank_correlation": None}
-    table = draws_table([{"seed": 0, "training": spread, "test": spread | {"spread": 0.05}}])
-    assert [row[1].text for row in table.rows] == ["0.0100", "0.0500"]
+    moved = {"test": spread | {"spread": 0.05}, "farthest": spread | {"spread": 0.09}}
+    table = draws_table([{"seed": 0, "training": spread, **moved}])
+    assert [row[1].text for row in table.rows] == ["0.0100", "0.0500", "0.0900"]
     error = {"chamfer": 0.02, "accuracy": 0.01, "completeness": 0.03, "f_score": 0.9}
     error |= {"distance": 0.024}
     table = geometry_table([{"seed": 0, "seen": None, "whole": error, "floor": error}])

@@ -29,7 +29,9 @@ def draw_offsets(key, precision: jax.Array, num: int, *, scale=1.0, limit=jnp.in
       [num, G, 3] scene units.
 
     Numerics: clipped to `limit`. A vertex that no ray has seen has the prior's variance, which is
-    far larger than the scene: its matter would be thrown out of the box, not moved.
+    far larger than the scene: its matter would be thrown out of the box, not moved. So has a vertex
+    in empty space that rays do cross, where the colour does not change to first order; an offset
+    of several cells would read matter there that the photos rule out.
     """
     noise = jax.random.normal(key, (num, *precision.shape), precision.dtype)
     return jnp.clip(scale * noise / jnp.sqrt(precision), -limit, limit)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import spearmanr
 
+from bavs_jax.fields.deformation import DeformationGrid, vertex_positions
 from bavs_jax.metrics.covered import MIN_OPACITY
 from bavs_jax.rendering.images import render_views
 from bavs_jax.uncertainty.draws import (
@@ -45,10 +46,12 @@ def farthest_view(run: TrainedRun, view_ids) -> int:
     return int(view_ids[np.argmax(np.linalg.norm(gaps, axis=-1).min(-1))])
 
 
-def largest_offset(run: TrainedRun, share: float) -> np.ndarray:
-    """`share` of the sides of the scene box, [3] scene units."""
-    lower, upper = np.asarray(run.problem.scene.box)
-    return share * (upper - lower)
+def largest_offset(grid: DeformationGrid, cells: float) -> np.ndarray:
+    """The sides of `cells` cells in the middle of the deformation grid, [3] scene units."""
+    side, middle = grid.cells + 1, grid.cells // 2
+    places = np.asarray(vertex_positions(grid)).reshape(side, side, side, 3)
+    ahead = places[middle + 1, middle + 1, middle + 1]
+    return cells * (ahead - places[middle, middle, middle])
 
 
 def draw_views(

@@ -7,7 +7,11 @@ from collections.abc import Callable
 from experiments.report import stats
 from experiments.report.tables import Cell, Table, interval_cell
 
-SPLITS = {"training": "training views", "test": "test views"}
+SPLITS = {  # of `draws.json`
+    "training": "training views",
+    "test": "test views",
+    "farthest": "the test view farthest from all training views",
+}
 
 
 def cleanup_table(rows: list[dict]) -> Table:
