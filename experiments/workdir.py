@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import pathlib
 
-from experiments.configs import base
 from experiments.errors import WorkdirError
 from experiments.files import write_atomic, write_json
 
@@ -34,27 +33,6 @@ def claim(workdir: pathlib.Path, config) -> None:
                     "use another --workdir or the same config"
                 )
     write_json(path, values)
-
-
-def load_config(workdir: pathlib.Path):
-    """The config of an experiment from its `config.json`; options that it lacks have defaults.
-
-    Raises:
-      WorkdirError: there is none.
-    """
-    path = workdir / "config.json"
-    if not path.exists():
-        raise WorkdirError(f"{path}: no such file; give the --workdir of an experiment")
-    config = base.get_config()
-    config.update(_tuples(json.loads(path.read_text(encoding="utf-8"))))
-    return config
-
-
-def _tuples(value):
-    """JSON knows no tuples, and options are never lists."""
-    if isinstance(value, dict):
-        return {name: _tuples(part) for name, part in value.items()}
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def _leaves(values: dict, prefix: str = "") -> dict[str, str]:

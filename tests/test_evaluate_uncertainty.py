@@ -185,6 +185,7 @@ def test_saved_intervals_give_the_bands_of_the_page(finished):
     assert (known >= ends[0] * (1 - 1e-6)).all() and (known <= ends[1] * (1 + 1e-6)).all()
 
 
+@pytest.mark.slow
 def test_a_killed_evaluation_goes_on_and_does_nothing_twice(finished):
     base, *_ = finished
     models = ("laplace", "learned_variance", "entropy", "ensemble")

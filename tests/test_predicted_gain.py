@@ -307,6 +307,7 @@ def test_rounds_on_other_test_views_are_left_out(tmp_path):
     assert [case.round for case in cases] == [2, 3] and left_out == 2
 
 
+@pytest.mark.slow
 def test_a_plan_begins_with_what_the_run_itself_predicted(tmp_path):
     """Runs the real loop, then predicts its batches anew from the checkpoint of round 0."""
     config = toy_config(predict_gain=True, policies=("random",), num_test_final=2)

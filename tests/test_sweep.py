@@ -45,12 +45,14 @@ def disturbed(tmp_path_factory):
     return work, stopped, left, end_of(process)
 
 
+@pytest.mark.slow
 def test_ctrl_c_stops_every_process_and_says_so(disturbed):
     _, (code, out), left, _ = disturbed
     assert code == 130 and "the same command goes on" in out and "Traceback" not in out
     assert left == []
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_or_run_twice(disturbed):
     work, _, _, (code, out) = disturbed
     assert code == 0, out
@@ -65,6 +67,7 @@ def test_nothing_is_lost_or_run_twice(disturbed):
     assert (work / "report.html").exists() and (work / "next_views" / "transforms.json").exists()
 
 
+@pytest.mark.slow
 def test_a_finished_sweep_runs_nothing_again(disturbed):
     work, *_ = disturbed
     before = (work / "random" / "seed_0" / "result.json").stat().st_mtime_ns
@@ -82,6 +85,7 @@ def half_failed(tmp_path_factory):
     return work, end_of(start_sweep([*flags, f"--workdir={work}"]))
 
 
+@pytest.mark.slow
 def test_a_setting_that_fails_does_not_stop_the_others(half_failed):
     work, (code, out) = half_failed
     assert code == 1 and "Traceback" not in out
@@ -94,6 +98,7 @@ def test_a_setting_that_fails_does_not_stop_the_others(half_failed):
     assert record.missing("num_initial=2", {("random", 0)}) == {}
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_and_killed_ends_like_an_undisturbed_one(disturbed, half_failed):
     killed = result(disturbed[0], "random", 0)["rounds"]
     undisturbed = result(half_failed[0] / "num_initial=2", "random", 0)["rounds"]

@@ -26,6 +26,7 @@ def test_a_target_is_reached_where_it_is_first_seen():
     assert first_seconds(curve, ["25", "28", "30"]) == {"25": 3.0, "28": 5.0, "30": None}
 
 
+@pytest.mark.slow
 def test_script_measures_with_a_cold_and_a_warm_cache(tmp_path):
     command = [sys.executable, "-m", "experiments.time_to_quality", f"--workdir={tmp_path}"]
     command += [*toy_flags(train__num_steps=16, train__steps_per_call=8, march__num_slots=8)]

@@ -18,13 +18,15 @@ from bavs_jax.candidates import Candidates
 from bavs_jax.prediction import make_predict_fn
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
-from experiments import runtime, workdir
+from experiments import runtime
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
+from experiments.errors import WorkdirError
 from experiments.predicted.cases import realised_gain
 from experiments.progress import track
 from experiments.report.results import Run as FinishedRun
 from experiments.runner import Run
+from experiments.trained import saved_config
 
 
 def comparable_rows(rounds: Sequence[dict]) -> list[dict]:
@@ -45,11 +47,11 @@ def plan_ahead(folder: pathlib.Path, runs: Sequence[FinishedRun]) -> list[Finish
     Raises:
       WorkdirError: the runs' pictures were taken at free poses.
     """
-    config = workdir.load_config(folder)
+    config = saved_config(folder)
     scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
     problem = build_problem(config, scene)
     if problem.has_empty_views:
-        raise workdir.WorkdirError(
+        raise WorkdirError(
             f"{folder}: config.candidates.source: pictures were taken at free poses, which cannot "
             "be predicted afterwards; record predictions with --config.predict_gain=True"
         )
