@@ -26,7 +26,7 @@ FLAGS = flags.FLAGS
 flags.DEFINE_string("data", None, "Folder of the capture, in any layout that can be loaded.")
 flags.DEFINE_string("workdir", None, "Folder for poses, checkpoints and report.html.")
 flags.DEFINE_integer("num_views", 10, "How many poses to propose.")
-flags.DEFINE_string("policy", "bavs", "Acquisition policy that chooses.")
+flags.DEFINE_string("policy", "bavs_spread", "Acquisition policy that chooses.")
 flags.DEFINE_integer("holdout", 0, "Photos left out of training, to measure the field on.")
 flags.DEFINE_string("loader", "auto", "Layout of the folder; auto: by the files in it.")
 flags.DEFINE_integer("image_size", 135, "Width in pixels to which the widest photo is reduced.")

@@ -159,7 +159,7 @@ def test_intervals_are_of_views_that_nothing_was_trained_on(finished):
     views = set().union(*split.values())
     # 25 test views and the 96 of the pool that were not trained on.
     assert sum(sizes) == len(views) == 121 and sizes[1] >= 48
-    summary = json.loads((base / "bavs" / "seed_0" / "result.json").read_text())
+    summary = json.loads((base / "bavs_spread" / "seed_0" / "result.json").read_text())
     trained = set().union(*(one["selected"] for one in summary["rounds"]))
     assert len(trained) == 4 and not views & trained
     for row in result["rows"]:
