@@ -12,8 +12,8 @@ from bavs_jax.fields.deformation import DeformationGrid, displace
 from bavs_jax.rendering.compositing import expected_depth, render_weights
 from bavs_jax.rendering.occupancy import init_occupancy
 from bavs_jax.rendering.samplers import make_occupancy_sampler
-from bavs_jax.rendering.sampling import make_march_options, march
-from bavs_jax.uncertainty.curvature import composited_jacobian, field_slopes, sample_positions
+from bavs_jax.rendering.sampling import make_march_options, march, sample_positions
+from bavs_jax.uncertainty.curvature import composited_jacobian, field_slopes
 from bavs_jax.uncertainty.posterior import laplace_variance, offset_variance, posterior_precision
 from bavs_jax.uncertainty.predictive import depth_jacobian, make_predictive_fn, predictive_variance
 from tests.oracles_curvature import colours_with_offsets, dense_depth_jacobian, dense_jacobian

@@ -15,7 +15,7 @@ from bavs_jax.fields.base import Field
 from bavs_jax.rendering.compositing import composite_colour, render_weights
 from bavs_jax.rendering.histograms import even_places, sample_histogram
 from bavs_jax.rendering.samplers import Sampler, dense_samples
-from bavs_jax.rendering.sampling import flatten_inputs
+from bavs_jax.rendering.sampling import flatten_inputs, sample_positions
 
 PADDING = 1e-5  # weight that each coarse interval gets on top, as in NeRF
 
@@ -79,7 +79,7 @@ def _stratified(key, num_rays: int, count: int) -> jax.Array:
 
 
 def _render_coarse(coarse: Field, params, rays, samples, background):
-    positions = rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]
+    positions = sample_positions(rays, samples)
     directions = jnp.broadcast_to(rays.directions[:, None], positions.shape)
     inputs = flatten_inputs(coarse.inputs(rays, samples))
     density, rgb = coarse.apply(

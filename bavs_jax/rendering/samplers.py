@@ -13,7 +13,13 @@ import jax.numpy as jnp
 
 from bavs_jax.rendering.compositing import render_weights
 from bavs_jax.rendering.occupancy import init_occupancy, update_occupancy
-from bavs_jax.rendering.sampling import MarchOptions, Samples, flatten_inputs, march
+from bavs_jax.rendering.sampling import (
+    MarchOptions,
+    Samples,
+    flatten_inputs,
+    march,
+    sample_positions,
+)
 
 
 class Sampler(NamedTuple):
@@ -91,7 +97,7 @@ def dense_samples(t_mids: jax.Array, deltas: jax.Array, is_empty: jax.Array) -> 
 
 def field_weights(field: Any, params, rays, samples: Samples) -> jax.Array:
     """Rendering weights [R, S] of a density field at samples."""
-    positions = rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]
+    positions = sample_positions(rays, samples)
     inputs = flatten_inputs(field.inputs(rays, samples))
     density = field.density(params, positions.reshape(-1, 3), **inputs)
     return render_weights(density.reshape(samples.t_mids.shape), samples.deltas)

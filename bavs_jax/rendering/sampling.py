@@ -30,6 +30,11 @@ def flatten_inputs(inputs: dict) -> dict:
     return {name: x.reshape(-1, *x.shape[2:]) for name, x in inputs.items()}
 
 
+def sample_positions(rays: Rays, samples: Samples) -> jax.Array:
+    """Where samples are, [R, S, 3] scene units."""
+    return rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]
+
+
 def first_slots(samples: Samples, num_slots: int) -> Samples:
     """The same samples with fewer slots, for rays that have no more valid ones than that."""
     return samples.replace(

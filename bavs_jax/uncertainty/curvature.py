@@ -26,7 +26,7 @@ from bavs_jax.fields.deformation import (
 )
 from bavs_jax.numerics import computed_once
 from bavs_jax.rendering.compositing import composite_colour, render_weights
-from bavs_jax.rendering.sampling import Samples, flatten_inputs
+from bavs_jax.rendering.sampling import Samples, flatten_inputs, sample_positions
 
 WEIGHTINGS = ("eq13", "eq11", "empirical")
 
@@ -131,11 +131,6 @@ def composited_jacobian(
     )
     jacobian = by_density[..., None] * slopes.density_slope[:, None]
     return jacobian + jnp.einsum("rcsk,rskd->rcsd", by_rgb, slopes.rgb_slope), colour
-
-
-def sample_positions(rays: Rays, samples: Samples) -> jax.Array:
-    """Where samples are, [R, S, 3] scene units."""
-    return rays.origins[:, None] + samples.t_mids[..., None] * rays.directions[:, None]
 
 
 def weight_jacobian(jacobian: jax.Array, residual: jax.Array | None, weighting: str) -> jax.Array:

@@ -25,12 +25,11 @@ from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.numerics import computed_once
 from bavs_jax.rendering.compositing import expected_depth, render_weights
 from bavs_jax.rendering.samplers import Sampler
-from bavs_jax.rendering.sampling import Samples, first_slots
+from bavs_jax.rendering.sampling import Samples, first_slots, sample_positions
 from bavs_jax.uncertainty.curvature import (
     FieldSlopes,
     composited_jacobian,
     field_slopes,
-    sample_positions,
     vertex_squares,
 )
 from bavs_jax.uncertainty.streaming import bucket_sizes, bucketed_rows
