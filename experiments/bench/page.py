@@ -5,13 +5,12 @@ from __future__ import annotations
 import pathlib
 from typing import NamedTuple
 
-import jinja2
 from markupsafe import Markup
 
 from experiments.bench import plots
 from experiments.bench.results import facts, growth_table, quality_table, stage_table
-from experiments.files import write_atomic
 from experiments.report.tables import Table
+from experiments.web.page import write_template
 
 
 class Section(NamedTuple):
@@ -32,18 +31,8 @@ def write_page(path: pathlib.Path, *, title: str, made: dict, sections: list[Sec
       made: the result file: how and on what it was made.
       sections: from top to bottom.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(pathlib.Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     sections = [s._replace(plots=[Markup(svg) for svg in s.plots]) for s in sections]
-    text = environment.get_template("template.html").render(
-        title=title, made=made, sections=sections
-    )
-    write_atomic(path, lambda file: file.write(text.encode()))
+    write_template(path, pathlib.Path(__file__).parent, title=title, made=made, sections=sections)
 
 
 def benchmark_sections(result: dict) -> list[Section]:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import pathlib
 from collections.abc import Sequence
 
-import jinja2
 from markupsafe import Markup
 
-from experiments.files import write_atomic
 from experiments.predicted.cases import Case
 from experiments.predicted.plots import gain_plot
 from experiments.predicted.results import HELD_OUT, correlation_table, stop_table
+from experiments.web.page import write_template
 
 
 def write_page(path: pathlib.Path, *, cases: Sequence[Case], result: dict) -> None:
@@ -22,14 +21,9 @@ def write_page(path: pathlib.Path, *, cases: Sequence[Case], result: dict) -> No
       cases: all batches.
       result: the result file.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(pathlib.Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    text = environment.get_template("template.html").render(
+    write_template(
+        path,
+        pathlib.Path(__file__).parent,
         scenes=", ".join(dict.fromkeys(case.scene for case in cases)),
         num_cases=len(cases),
         left_out=result["left_out"],
@@ -39,4 +33,3 @@ def write_page(path: pathlib.Path, *, cases: Sequence[Case], result: dict) -> No
         correlations=correlation_table(result),
         stops=[(held, stop_table(result, held)) for held in HELD_OUT],
     )
-    write_atomic(path, lambda file: file.write(text.encode()))

@@ -6,13 +6,12 @@ import json
 import os
 from pathlib import Path
 
-import jinja2
 from markupsafe import Markup
 
-from experiments.files import write_atomic
 from experiments.report import camera_map, choices, gaps, pictures, plots, stats, tables
 from experiments.report.headline import focus_policy, make_headline
 from experiments.report.results import Run, load_acquisition, load_pictures, load_runs
+from experiments.web.page import write_template
 
 # The first seed of each policy is shown at full size, the others folded away and smaller.
 MAX_SIDE, MAX_SIDE_FOLDED = 320, 160  # pixels
@@ -33,17 +32,8 @@ def write_report(workdir: str | os.PathLike) -> Path:
     """
     workdir = Path(workdir)
     runs = load_runs(workdir)
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(
-        loader=loader,
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template("template.html").render(**page_content(runs))
     path = workdir / "report.html"
-    write_atomic(path, lambda file: file.write(page.encode()))
+    write_template(path, Path(__file__).parent, **page_content(runs))
     return path
 
 

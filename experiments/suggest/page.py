@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 import pathlib
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
 from bavs_jax.selection.worth import Worth
-from experiments.files import write_atomic
 from experiments.report.pictures import (
     UNCERTAINTY_MAP,
     colourise,
@@ -18,24 +16,16 @@ from experiments.report.pictures import (
     shrink,
     uncertainty_limits,
 )
+from experiments.web.page import write_template
 
 MAX_SIDE = 300  # pixels of a preview
 
 
 def write_page(path: pathlib.Path, **content) -> None:
     """Fills the template; every name that it uses must be in `content`."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(pathlib.Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     for name in ("place", "worth_curve"):
         content[name] = Markup(content[name])
-    text = environment.get_template("template.html").render(**content)
-    write_atomic(path, lambda file: file.write(text.encode()))
-    path.chmod(0o644)  # temporary files start out private
+    write_template(path, pathlib.Path(__file__).parent, **content)
 
 
 def preview_cards(images: list[dict], rows: list[dict], sentences: list[str]) -> tuple:

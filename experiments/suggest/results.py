@@ -17,6 +17,7 @@ from experiments.build import RENDER_CHUNK, Problem
 from experiments.files import write_json
 from experiments.machine import device_name, peak_memory_mb
 from experiments.progress import track
+from experiments.report.tables import Cell, Table
 from experiments.suggest import exports, page, plots
 from experiments.suggest.choosing import Suggestion, photo_rays
 from experiments.suggest.facts import length, pose_facts
@@ -191,7 +192,7 @@ def write_results(
         ),
         candidates=_candidate_words(options, proposals, suggestion, around),
         worth_curve=plots.worth_plot(suggestion.worth, suggestion.photo_gain),
-        table=_table(rows, poses, facts),
+        numbers=_numbers(rows, poses, facts),
         command=command,
         details=_details(problem, options, around, quality, foggy, seconds_fn()),
     )
@@ -261,7 +262,7 @@ def _place_words(pose: np.ndarray) -> str:
     return f"at ({place}), looks along ({look})"
 
 
-def _table(rows, poses, facts) -> dict:
+def _numbers(rows, poses, facts) -> Table:
     head = ("no.", "picked", "x", "y", "z", "score", "information, of the best", "high pixels")
     head += ("nearest photo", "photos that see the place")
     cells = [
@@ -277,7 +278,7 @@ def _table(rows, poses, facts) -> dict:
         ]
         for row, pose, fact in zip(rows, poses, facts)
     ]
-    return {"head": head, "rows": cells}
+    return Table(head, tuple(tuple(map(Cell, row)) for row in cells))
 
 
 def _details(problem, options, around: Surroundings, quality, foggy, seconds) -> list[tuple]:

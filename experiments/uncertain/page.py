@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import pathlib
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from experiments.files import write_atomic
 from experiments.report.pictures import ERROR_MAP, UNCERTAINTY_MAP, colourise, png_uri, shrink
 from experiments.uncertain.band_picture import LEVEL, band_strip, scanline_plot
 from experiments.uncertain.coverage_plots import coverage_plot, decile_plot, width_plot
@@ -23,6 +21,7 @@ from experiments.uncertain.results import (
     title,
 )
 from experiments.uncertain.tables import ause_table, coverage_table, summary_table
+from experiments.web.page import write_template
 
 MAX_SIDE = 240  # pixels of a picture
 
@@ -36,20 +35,15 @@ def write_page(path: pathlib.Path, result: dict, *, arrays: dict, variant: str) 
       arrays: by model, the arrays of each seed; pictures are those of the first seed.
       variant: the AUSE that is shown first.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(pathlib.Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     rows = result["rows"]
     variants = known_variants(rows)
     variant = variant if variant in variants else variants[0]
     titles = {field: f"Error of what is left, {words}" for field, words in FIELDS.items()}
     pictures = {model: found[0] for model, found in arrays.items()}
     shown = models_of(rows)[0]
-    text = environment.get_template("template.html").render(
+    write_template(
+        path,
+        pathlib.Path(__file__).parent,
         title=title(result),
         result=result,
         variant=variant,
@@ -68,7 +62,6 @@ def write_page(path: pathlib.Path, result: dict, *, arrays: dict, variant: str) 
         scanline=Markup(scanline_plot(pictures[shown], shown)),
         strips=_strips(pictures),
     )
-    write_atomic(path, lambda file: file.write(text.encode()))
 
 
 def _strips(pictures: dict[str, dict[str, np.ndarray]]) -> list[dict]:

@@ -1,0 +1,1 @@
+"""What all pages share: how a template is filled, the look, and how a table is shown."""
