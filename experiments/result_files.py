@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pathlib
 from collections.abc import Callable
 from functools import partial
@@ -12,6 +11,7 @@ from experiments.posthoc.tables import TABLES as POSTHOC_TABLES
 from experiments.predicted.results import RESULT_FILE as GAIN_FILE
 from experiments.predicted.results import correlation_table, stop_table
 from experiments.report.collected import Collected, collect_tables
+from experiments.report.results import read_result
 from experiments.report.tables import Table
 from experiments.sweeps.record import FILE as SWEEP_FILE
 from experiments.uncertain import results as uncertain
@@ -36,7 +36,7 @@ def _uncertainty(path: pathlib.Path) -> Collected:
 
 def _posthoc(make_table: Callable[[list[dict]], Table], path: pathlib.Path) -> Collected:
     """What a script on a trained run has measured, over its seeds."""
-    result = json.loads(path.read_text(encoding="utf-8"))
+    result = read_result(path)
     num = len({row["seed"] for row in result["rows"]})
     over = "1 seed" if num == 1 else f"means over {num} seeds ± half of the 95 % interval"
     return Collected(_made_by(result, over), {path.stem: make_table(result["rows"])})
@@ -44,7 +44,7 @@ def _posthoc(make_table: Callable[[list[dict]], Table], path: pathlib.Path) -> C
 
 def _gain(path: pathlib.Path) -> Collected:
     """How well predicted gains tell realised ones, and the stop rule tried on left-out seeds."""
-    result = json.loads(path.read_text(encoding="utf-8"))
+    result = read_result(path)
     made = "; ".join(f"`{command}`" for command in result["commands"])
     tables = {"correlation": correlation_table(result), "stop": stop_table(result, "seed")}
     return Collected(f"{made}: {len(result['cases'])} batches", tables)

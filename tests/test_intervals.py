@@ -142,7 +142,7 @@ def test_saved_calibration_puts_the_same_bands_around_new_views(tmp_path):
     [
         (None, "no such file"),
         ("{", "not JSON"),
-        ('{"schema_version": 99}', "schema_version: is 99"),
+        ('{"schema_version": 99}', "schema_version is 99"),
         ('{"schema_version": 1}', "calibration: no such entry"),
     ],
 )

@@ -296,7 +296,7 @@ def test_tables_of_draws_and_geometry():
 
 def test_result_files_of_trained_runs_fill_a_page(tmp_path):
     rows = [cleaned_row(0, before=(20.0, 22.0), after=(20.5, 23.0), floating=(0.10, 0.02))]
-    result = {"command": "python -m x", "device": "CPU", "rows": rows}
+    result = {"schema_version": 1, "command": "python -m x", "device": "CPU", "rows": rows}
     (tmp_path / "cleanup.json").write_text(json.dumps(result))
     page = "<!-- results: . -->\nold\n<!-- end of results -->\n"
     lines = fill_page(page, tmp_path).splitlines()

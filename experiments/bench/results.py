@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import pathlib
 
 from experiments.report.collected import Collected
 from experiments.report.plots import seconds
+from experiments.report.results import read_result
 from experiments.report.tables import Cell, Table, dash
 
 BENCHMARK, QUALITY = "benchmark.json", "time_to_quality.json"
@@ -99,7 +99,7 @@ def facts(result: dict) -> list[str]:
 
 def benchmark_tables(path: pathlib.Path) -> Collected:
     """What a benchmark found."""
-    result = json.loads(path.read_text(encoding="utf-8"))
+    result = read_result(path)
     tables = {"stages": stage_table(result)}
     if (growth := growth_table(result)) is not None:
         tables["growth"] = growth
@@ -108,6 +108,6 @@ def benchmark_tables(path: pathlib.Path) -> Collected:
 
 def quality_tables(path: pathlib.Path) -> Collected:
     """How long it took to each quality."""
-    result = json.loads(path.read_text(encoding="utf-8"))
+    result = read_result(path)
     made = f"`{result['command']}` ({result['device']})"
     return Collected(made, {"time_to_quality": quality_table(result)})

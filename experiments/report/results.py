@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
+
+from experiments.versioned import read_versioned
 
 SCHEMA_VERSION = 1
 PICTURE_KEYS = ("view_ids", "names", "truth", "rgb", "error", "uncertainty", "round")
@@ -44,6 +45,21 @@ class Run:
         return f"{self.policy}, seed {self.seed}"
 
 
+def read_result(path: Path) -> dict:
+    """The content of a script's result file.
+
+    Raises:
+      ReportError: the file is missing, broken or of another version.
+    """
+    return read_versioned(
+        path,
+        SCHEMA_VERSION,
+        error=ReportError,
+        absent="give the --workdir of an experiment",
+        fix="run the experiment again",
+    )
+
+
 def load_runs(workdir: Path) -> list[Run]:
     """All runs of `summary.json`, in its order.
 
@@ -51,17 +67,7 @@ def load_runs(workdir: Path) -> list[Run]:
       ReportError: the file is missing or broken, or holds runs of more than one scene.
     """
     path = workdir / "summary.json"
-    try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ReportError(f"{path}: no such file; give the --workdir of an experiment") from None
-    except json.JSONDecodeError as error:
-        raise ReportError(f"{path}: not JSON ({error}); run the experiment again") from None
-    if summary.get("schema_version") != SCHEMA_VERSION:
-        raise ReportError(
-            f"{path}: schema_version is {summary.get('schema_version')}, this program reads "
-            f"{SCHEMA_VERSION}; run the experiment again"
-        )
+    summary = read_result(path)
     runs = [_load_run(result, path) for result in summary["runs"]]
     scenes = sorted({run.result["scene"]["name"] for run in runs})
     if len(scenes) > 1:

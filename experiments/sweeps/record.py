@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import pathlib
 from typing import Any
 
 from experiments.errors import WorkdirError
 from experiments.files import write_json
+from experiments.versioned import read_versioned
 
 SCHEMA_VERSION = 1
 FILE = "sweep.json"
@@ -42,15 +42,8 @@ def read_record(workdir: pathlib.Path) -> Record | None:
     path = workdir / FILE
     if not path.exists():
         return None
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise WorkdirError(f"{path}: not JSON ({error}); delete it, run the sweep again") from None
-    if content.get("schema_version") != SCHEMA_VERSION:
-        raise WorkdirError(
-            f"{path}: schema_version is {content.get('schema_version')}, this program reads "
-            f"{SCHEMA_VERSION}; delete it and run the sweep again"
-        )
+    fix = "delete it and run the sweep again"
+    content = read_versioned(path, SCHEMA_VERSION, error=WorkdirError, absent=fix, fix=fix)
     return Record(content["command"], content["settings"], content["failed"])
 
 

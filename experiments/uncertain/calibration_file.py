@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pathlib
 
 from bavs_jax.uncertainty.bands import (
@@ -12,6 +11,7 @@ from bavs_jax.uncertainty.bands import (
 )
 from experiments.errors import WorkdirError
 from experiments.files import write_json
+from experiments.versioned import read_versioned
 
 SCHEMA_VERSION = 1
 
@@ -39,17 +39,13 @@ def load_calibration(path: pathlib.Path) -> RenderCalibration:
     Raises:
       WorkdirError: the file is missing or broken, or of another version.
     """
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise WorkdirError(f"{path}: no such file; run experiments.evaluate_uncertainty") from None
-    except json.JSONDecodeError as error:
-        raise WorkdirError(f"{path}: not JSON ({error}); make it anew") from None
-    if values.get("schema_version") != SCHEMA_VERSION:
-        raise WorkdirError(
-            f"{path}: schema_version: is {values.get('schema_version')}, this program reads "
-            f"{SCHEMA_VERSION}; make it anew"
-        )
+    values = read_versioned(
+        path,
+        SCHEMA_VERSION,
+        error=WorkdirError,
+        absent="run experiments.evaluate_uncertainty",
+        fix="make it anew",
+    )
     try:
         return calibration_from_json(values.get("calibration") or {})
     except ValueError as error:

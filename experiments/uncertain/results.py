@@ -9,6 +9,7 @@ import numpy as np
 
 from experiments.files import write_atomic
 from experiments.report import ReportError
+from experiments.versioned import read_versioned
 
 SCHEMA_VERSION = 2  # of uncertainty.json
 ROW_VERSION = 2  # of one model and seed; rows of another version are made anew
@@ -29,17 +30,13 @@ def load_result(folder: pathlib.Path) -> dict:
       ReportError: the file is missing or broken, or of another version.
     """
     path = folder / NAME
-    try:
-        result = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ReportError(f"{path}: no such file; give the --workdir of an evaluation") from None
-    except json.JSONDecodeError as error:
-        raise ReportError(f"{path}: not JSON ({error}); run the evaluation again") from None
-    if result.get("schema_version") != SCHEMA_VERSION:
-        raise ReportError(
-            f"{path}: schema_version is {result.get('schema_version')}, this program reads "
-            f"{SCHEMA_VERSION}; run the evaluation again"
-        )
+    result = read_versioned(
+        path,
+        SCHEMA_VERSION,
+        error=ReportError,
+        absent="give the --workdir of an evaluation",
+        fix="run the evaluation again",
+    )
     if not result.get("rows"):
         raise ReportError(f"{path}: rows: there are none; run the evaluation again")
     return result
