@@ -38,7 +38,7 @@ def load_config_scene(config, *, cache_dir: str | None) -> Scene:
     options = {name: value for name, value in config.load.items() if value}
     if options.get("pool_size", 0.0) >= 1:
         options["pool_size"] = int(options["pool_size"])
-    return load_scene(config.loader, root=root, image_size=config.image_size, **options)
+    return load_scene(config.loader, root=root, image_size=config.image_size or None, **options)
 
 
 def true_surface(config) -> Callable | None:

@@ -51,6 +51,12 @@ def end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
+def _first_and_last_line(error: Exception) -> str:
+    """An error in one line: of a config file's traceback, where it was read and what went wrong."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return " ".join(dict.fromkeys([lines[0], lines[-1]]))
+
+
 def run_script(main: Callable[[], None]) -> None:
     """Runs a script's `main()` after reading its flags; wrong ones end in one line."""
 
@@ -58,7 +64,7 @@ def run_script(main: Callable[[], None]) -> None:
         try:
             return flags.FLAGS(argv)
         except flags.Error as error:
-            sys.exit(f"error: {error}; --help explains every flag")
+            sys.exit(f"error: {_first_and_last_line(error)}; --help explains every flag")
         except FLAG_ERRORS as error:
             reason = " ".join(str(error).split())
             sys.exit(f"error: --config: no such option, or a value of another type: {reason}")

@@ -10,7 +10,7 @@ def get_config() -> ConfigDict:
     config.loader = "procedural"  # a key of bavs_jax.scenes.LOADERS
     config.data_dir = ""  # folder of scenes; empty: $BAVS_DATA/<loader>
     config.scene = "sculpture"  # folder in data_dir (the procedural scene has just this one)
-    config.image_size = 100  # pixels of the image width
+    config.image_size = 100  # pixels of the image width; 0: as the files are
 
     # --- how its files are read (bavs_jax/scenes); 0 or False: as the loader sees fit ---
     config.load = ConfigDict()
@@ -19,6 +19,7 @@ def get_config() -> ConfigDict:
     config.load.pool_size = 0.0  # views that may be trained on: a count, or a share below 1
     config.load.test_every = 0  # instead: every so many-th view is a test view
     config.load.seed = 0  # draws the pool
+    config.load.split = ""  # loader "lightfield": a published split; see scenes/lightfield.py
 
     # --- the experiment ---
     config.policies = ("bavs", "random")  # see --list_policies; the first one's views are exported

@@ -1,0 +1,117 @@
+"""The configs of the paper's tables and figures: they build in both sizes, and Table 3 runs."""
+
+import importlib
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from bavs_jax.selection.policies import POLICIES
+from experiments.build import build_problem
+from experiments.configs.paper import table_3
+from experiments.report.printed import TABLES
+from tests.scene_files import write_nerfstudio
+from tests.toy_runs import OVERRIDES
+from tests.toy_scenes import toy_scene
+
+ROOT = pathlib.Path(__file__).parents[1]
+SIZED = ("table_1", "table_2", "table_3", "table_4", "figure_6", "figure_7", "figure_8")
+
+
+def load(name, *size):
+    return importlib.import_module(f"experiments.configs.paper.{name}").get_config(*size)
+
+
+@pytest.mark.parametrize("size", ["laptop", "paper"])
+@pytest.mark.parametrize("name", SIZED)
+def test_every_size_builds(name, size):
+    config = load(name, size)
+    assert set(config.policies) <= set(POLICIES)
+    problem = build_problem(config, toy_scene())
+    train = jax.eval_shape(problem.init_train, jax.random.key(0))
+    assert jax.tree.leaves(train.params)
+
+
+@pytest.mark.parametrize("name", SIZED)
+def test_the_laptop_size_is_the_default_and_the_smaller_one(name):
+    laptop, paper = load(name), load(name, "paper")
+    assert laptop.to_dict() == load(name, "laptop").to_dict()
+    assert laptop.train.num_steps < paper.train.num_steps
+    assert laptop.image_size < (paper.image_size or np.inf)
+
+
+def test_the_protocols_are_the_printed_ones():
+    tables = {name: load(name, "paper") for name in SIZED}
+    views = {
+        name: (c.num_initial, c.num_initial + c.num_rounds * c.batch_size)
+        for name, c in tables.items()
+    }
+    assert views["table_1"] == views["figure_6"] == (4, 20)
+    assert views["table_2"] == views["table_4"] == views["figure_8"] == (50, 60)
+    assert views["figure_7"] == (10, 100)
+    assert tables["table_1"].train.num_steps == 40_000
+    assert tables["figure_7"].train.num_steps * (tables["figure_7"].num_rounds + 1) == 30_000
+    assert (tables["table_2"].load.pool_size, tables["table_4"].load.pool_size) == (200.0, 300.0)
+    for name, rows in TABLES.items():
+        assert {row.policy for row in rows if row.policy} <= set(tables[name].policies)
+
+
+def test_an_unknown_size_ends_in_one_line():
+    command = "experiments.active_selection --config=experiments/configs/paper/table_1.py:big"
+    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        [sys.executable, "-m", *command.split()],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=environment,
+        check=False,
+    )
+    assert done.returncode != 0 and len(done.stderr.strip().splitlines()) == 1
+    assert "size 'big': use one of laptop, paper" in done.stderr
+
+
+def test_table_3_follows_its_scene():
+    config = table_3.get_config()
+    config.scene = "torch"
+    assert config.load.split == "torch" and config.loader == "lightfield"
+    config.load.split = "basket-cfnerf"
+    assert config.scene == "torch"
+
+
+@pytest.mark.slow
+def test_table_3_runs_on_the_layout_with_true_depth(tmp_path):
+    root = write_nerfstudio(tmp_path / "africa", num=14, width=24, height=16)
+    rng = np.random.default_rng(0)
+    for n in range(4):
+        np.save(root / f"depth_gt_{n:02d}.npy", rng.uniform(3.0, 5.0, (16, 24)).astype(np.float32))
+    (root / "scale_parameters.txt").write_text("1.0")
+    kept = {k: v for k, v in OVERRIDES.items() if k.split(".")[0] in ("field", "march", "train")}
+    options = kept | {"image_size": 24, "data_dir": tmp_path, "scene": "africa", "seeds": "(0,)"}
+    options |= {"evaluation.models": "('laplace','entropy')", "uncertainty.log2_cells": 3}
+    work = tmp_path / "work"
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "experiments.evaluate_uncertainty", f"--workdir={work}"),
+            "--config=experiments/configs/paper/table_3.py",
+            *(f"--config.{name}={value}" for name, value in options.items()),
+        ],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=os.environ | {"JAX_PLATFORMS": "cpu"},
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads((work / "uncertainty.json").read_text())
+    assert [(row["model"], row["num_views"], row["num_test_views"]) for row in result["rows"]] == [
+        ("laplace", 5, 4),
+        ("entropy", 5, 4),
+    ]
+    depth = [row["own"]["depth_mae_per_image"] for row in result["rows"]]
+    assert all(np.isfinite(list(numbers.values())).all() for numbers in depth)
