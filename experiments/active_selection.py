@@ -14,6 +14,7 @@ import sys
 import time
 
 from absl import flags
+from jax.sharding import Mesh
 from ml_collections import config_flags
 
 from bavs_jax.selection.policies import POLICIES
@@ -22,7 +23,9 @@ from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
 from experiments.errors import USER_ERRORS
 from experiments.files import exclusive
+from experiments.job import start_job
 from experiments.parts import all_parts, find_part
+from experiments.processes import is_first_process
 from experiments.report import write_report
 from experiments.runner import Run
 
@@ -43,7 +46,9 @@ flags.DEFINE_bool("list_policies", False, "Print the known acquisition policies 
 flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
 
 
-def make_parts(config, folder: pathlib.Path, command: str, only: str | None = None) -> None:
+def make_parts(
+    config, folder: pathlib.Path, command: str, only: str | None = None, mesh: Mesh | None = None
+) -> None:
     """Every policy with every seed, each from the round 0 it shares; or only one part of that."""
     parts = all_parts(config.policies, config.seeds)
     if only is not None:
@@ -52,7 +57,7 @@ def make_parts(config, folder: pathlib.Path, command: str, only: str | None = No
     workdir.claim(folder, config)
     scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
     print(f"{scene.name}: {len(scene.pool)} views to choose from, {len(scene.test)} test views")
-    problems = {kind: build_problem(config, scene, kind) for kind in {p.kind for p in parts}}
+    problems = {kind: build_problem(config, scene, kind, mesh) for kind in {p.kind for p in parts}}
 
     def make(part, shared=None) -> Run:
         # Other processes may make other parts of the same folder, and need the same round 0.
@@ -67,14 +72,16 @@ def make_parts(config, folder: pathlib.Path, command: str, only: str | None = No
             first_rounds[part.initial] = make(part.initial)
         if part.policy is not None:
             make(part, first_rounds[part.initial])
-            if only is None:
+            if only is None and is_first_process():
                 workdir.collect(folder)
 
 
-def run_all(config, folder: pathlib.Path, command: str) -> None:
+def run_all(config, folder: pathlib.Path, command: str, mesh: Mesh | None) -> None:
     """All parts of a config, then the exported views and the report."""
     start = time.monotonic()
-    make_parts(config, folder, command)
+    make_parts(config, folder, command, mesh=mesh)
+    if not is_first_process():
+        return
     next_views = workdir.export_next_views(folder, config.policies[0], config.seeds[0])
     report = write_report(folder)
     print(f"chosen poses: {next_views}")
@@ -96,10 +103,11 @@ def main() -> None:
         runtime.end_with_parent()
     config, folder = FLAGS.config, pathlib.Path(FLAGS.workdir)
     try:
+        mesh = start_job()
         if FLAGS.part is not None:
-            make_parts(config, folder, runtime.command_line(), only=FLAGS.part)
+            make_parts(config, folder, runtime.command_line(), only=FLAGS.part, mesh=mesh)
         else:
-            run_all(config, folder, runtime.command_line())
+            run_all(config, folder, runtime.command_line(), mesh)
     except OSError as error:
         # The config file is only read when it is first used.
         sys.exit(f"error: {' '.join(str(error).split())}")

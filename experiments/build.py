@@ -10,8 +10,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from bavs_jax import active
+from bavs_jax.devices import num_shards, put_on_all
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.metrics.perceptual import make_lpips_fn
 from bavs_jax.prediction import make_predict_fn
@@ -79,21 +81,26 @@ def check_choices(config) -> None:
         check_choice(name, value, known)
 
 
-def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
+def build_problem(
+    config, scene: Scene, kind: str = RECONSTRUCTION, mesh: Mesh | None = None
+) -> Problem:
     """Puts fields, renderer, training, curvature and selection together.
 
     Args:
       config: see `experiments/configs/base.py`.
       scene: the scene.
       kind: of the field that the run trains and is measured on, one of `KINDS`.
+      mesh: devices that share the work, from `make_mesh`.
 
     Raises:
       ConfigError: an option that cannot be used.
     """
     check_choices(config)
-    table = make_pixel_table(scene)
-    source, table = make_source(config, scene, table)
-    trainers = {k: build_trainer(config, scene, len(table.cameras), k) for k in KINDS}
+    check_shards(config, mesh)
+    capacity = 8 * RENDER_CHUNK // num_shards(mesh)
+    source, table = make_source(config, scene, make_pixel_table(scene))
+    table = put_on_all(table, mesh)
+    trainers = {k: build_trainer(config, scene, len(table.cameras), k, mesh) for k in KINDS}
     trainer = trainers[kind]
     field, sampler = trainer.field, trainer.sampler
     background = field_background(scene)
@@ -102,17 +109,20 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
 
     @cache
     def curvature_fn(weighting: str):
-        return make_curvature_fn(field, sampler, grid, background=background, weighting=weighting)
+        return make_curvature_fn(
+            field, sampler, grid, background=background, weighting=weighting, mesh=mesh
+        )
 
     render_chunk = make_render_chunk_fn(
         field,
         sampler,
         grid,
         background=background,
-        capacity=8 * RENDER_CHUNK,
+        capacity=capacity,
         variant=laplace.variant,
         scale=laplace.scale,
         extent=laplace.extent,
+        mesh=mesh,
     )
 
     def render(state: TrainState, jac_sq_sum=None, num_rays: int = 0):
@@ -162,7 +172,7 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
             flow=trainers[FLOW].flow,
             kind=kind,
             background=background,
-            capacity=8 * RENDER_CHUNK,
+            capacity=capacity,
             grid=grid,
             laplace=laplace,
             group_size=group_size,
@@ -172,6 +182,7 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
             chunk=RENDER_CHUNK,
             ensemble_size=config.uncertainty.ensemble_size,
             num_draws=config.uncertainty.flow_draws,
+            mesh=mesh,
         )
 
     @cache
@@ -236,6 +247,16 @@ def build_problem(config, scene: Scene, kind: str = RECONSTRUCTION) -> Problem:
         has_empty_views=_has_empty_views(scene, table),
         first_empty_row=int(scene.offsets[-1]),
     )
+
+
+def check_shards(config, mesh: Mesh | None) -> None:
+    """Raises ConfigError if rays cannot be spread evenly over the devices of a mesh."""
+    for name, num in (("config.train.num_rays", config.train.num_rays), ("images", RENDER_CHUNK)):
+        if num % num_shards(mesh):
+            raise ConfigError(
+                f"{name}: {num} rays at once cannot be spread over {num_shards(mesh)} devices: "
+                "take a number of --devices that divides them"
+            )
 
 
 def _has_empty_views(scene: Scene, table: PixelTable) -> bool:

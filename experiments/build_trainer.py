@@ -8,7 +8,9 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
+from bavs_jax.devices import num_shards, put_on_all
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.flow_field import FlowField, mean_field
 from bavs_jax.rendering.samplers import Sampler
@@ -36,7 +38,9 @@ class Trainer(NamedTuple):
 KINDS = (RECONSTRUCTION, VARIANCE, FLOW)
 
 
-def build_trainer(config, scene: Scene, num_views: int, kind: str) -> Trainer:
+def build_trainer(
+    config, scene: Scene, num_views: int, kind: str, mesh: Mesh | None = None
+) -> Trainer:
     """Puts a field, its sampler, its objective and its optimiser together; compiles nothing yet.
 
     Args:
@@ -44,10 +48,12 @@ def build_trainer(config, scene: Scene, num_views: int, kind: str) -> Trainer:
       scene: the scene.
       num_views: views of the pixel table.
       kind: one of `KINDS`.
+      mesh: devices that share the rays and the sample buffer.
     """
     field, sampler = build_field(config, scene, num_views, learned_variance=kind == VARIANCE)
     train, flow = config.train, None
-    rendering = {"background": field_background(scene), "capacity": train.capacity}
+    capacity = train.capacity // num_shards(mesh)
+    rendering = {"background": field_background(scene), "capacity": capacity, "mesh": mesh}
     if kind == FLOW:
         flow = build_flow(config, scene)
         field = mean_field(flow)
@@ -70,8 +76,13 @@ def build_trainer(config, scene: Scene, num_views: int, kind: str) -> Trainer:
         num_rays=train.num_rays,
         penalty_weight=train.penalty_weight,
         steps_per_call=train.steps_per_call,
+        mesh=mesh,
     )
-    init = jax.jit(partial(init_train_state, field=field, sampler=sampler, optimiser=optimiser))
+    fresh = jax.jit(partial(init_train_state, field=field, sampler=sampler, optimiser=optimiser))
+
+    def init(key):
+        return put_on_all(fresh(key), mesh)
+
     return Trainer(field, sampler, init, call, flow)
 
 

@@ -11,9 +11,16 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from experiments.processes import is_first_process
+
 
 def write_atomic(path: str | os.PathLike, write_fn: Callable) -> None:
-    """Calls `write_fn(file)` on a temporary binary file beside `path`, then renames it."""
+    """Calls `write_fn(file)` on a temporary binary file beside `path`, then renames it.
+
+    Of several processes that work together, the first one writes; so it is everywhere here.
+    """
+    if not is_first_process():
+        return
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -39,6 +46,8 @@ def write_arrays(path: str | os.PathLike, **arrays) -> None:
 
 def append_line(path: str | os.PathLike, value: dict) -> None:
     """One JSON object as a line at the end of a file that several processes may write to."""
+    if not is_first_process():
+        return
     line = json.dumps(value, allow_nan=False) + "\n"
     with open(path, "ab", buffering=0) as file:
         # The lock is for folders that machines share: only there may two lines overlap.
@@ -52,6 +61,9 @@ def exclusive(folder: str | os.PathLike) -> Iterator[None]:
 
     The lock ends with the process that holds it: one that is killed leaves none behind.
     """
+    if not is_first_process():
+        yield
+        return
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / ".lock", "wb") as file:

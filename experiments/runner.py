@@ -24,6 +24,7 @@ from experiments.files import append_line, write_arrays, write_json
 from experiments.machine import device_name, peak_memory_mb, versions
 from experiments.parts import Part
 from experiments.predicted.cases import realised_gain
+from experiments.processes import as_first_process, is_first_process
 from experiments.progress import track
 from experiments.report.choices import bound_words
 
@@ -110,7 +111,7 @@ class Run:
                     shape = {k: float(getattr(info, k)) for k in ("rays", "samples", "thinned")}
                     at = {"round": int(state.round), "step": calls * steps}
                     self._log(event="train", **at, **numbers, **shape)
-                due = time.monotonic() - saved > self.config.checkpoint_seconds
+                due = as_first_process(time.monotonic() - saved > self.config.checkpoint_seconds)
                 if due or calls == calls_per_round:
                     self._save(state)
                     saved = time.monotonic()
@@ -206,15 +207,17 @@ class Run:
         if path.exists() and json.loads(path.read_text(encoding="utf-8"))["completed"]:
             return
         scene, config = self.problem.scene, self.config
+        if completed and self.seed == config.seeds[0]:
+            view_ids = spread_evenly(scene.test, config.num_pictures)
+            pictures = picture_arrays(self._uncertain_render_fn(state), scene, view_ids)
+            write_arrays(self.folder / "pictures.npz", **pictures, round=int(state.round))
+        if not is_first_process():
+            return
         choices = acquisitions.load_choices(self.folder, int(state.round))
         write_arrays(
             self.folder / "acquisition.npz",
             **acquisitions.acquisition_arrays(scene, self.initial, choices),
         )
-        if completed and self.seed == config.seeds[0]:
-            view_ids = spread_evenly(scene.test, config.num_pictures)
-            pictures = picture_arrays(self._uncertain_render_fn(state), scene, view_ids)
-            write_arrays(self.folder / "pictures.npz", **pictures, round=int(state.round))
         if completed:
             acquisitions.write_next_views(
                 self.folder / "next_views" / "transforms.json", scene, choices

@@ -12,7 +12,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
+from bavs_jax.devices import over_rays
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.flow_field import FlowField, base_draws
 from bavs_jax.numerics import MIN_VARIANCE
@@ -32,7 +34,7 @@ class Outcome(NamedTuple):
     ray_mask: jax.Array  # [R] bool, false for rays that did not fit the sample buffer
 
 
-def _render_batch(field: Field, background, capacity: int) -> Callable:
+def _render_batch(field: Field, background, capacity: int, mesh: Mesh | None) -> Callable:
     def render(params, batch: PixelBatch, samples) -> Rendering:
         return render_rays(
             batch.rays,
@@ -44,18 +46,21 @@ def _render_batch(field: Field, background, capacity: int) -> Callable:
             inputs=field.inputs(batch.rays, samples, batch.view_ids),
         )
 
-    return render
+    return over_rays(render, mesh, spread=(False, True, True))
 
 
-def make_colour_objective(field: Field, *, background, capacity: int) -> Callable:
+def make_colour_objective(
+    field: Field, *, background, capacity: int, mesh: Mesh | None = None
+) -> Callable:
     """Mean squared colour error (Eq 5).
 
     Args:
       field: the radiance field.
       background: [3] colour behind everything, or None (see `composite_colour`).
-      capacity: places of the buffer for valid samples; a dense sampler needs none.
+      capacity: places of each device's buffer for valid samples; a dense sampler needs none.
+      mesh: devices that share the rays (see `devices.py`).
     """
-    render = _render_batch(field, background, capacity)
+    render = _render_batch(field, background, capacity, mesh)
 
     def objective(key, params, batch, samples):
         del key
@@ -73,6 +78,7 @@ def make_variance_objective(
     capacity: int,
     density_weight: float = 0.01,
     through_weights: bool = False,
+    mesh: Mesh | None = None,
 ) -> Callable:
     """Likelihood of the colours under the rendered variance (ActiveNeRF, Pan et al. 2022).
 
@@ -90,8 +96,9 @@ def make_variance_objective(
       background, capacity: see `make_colour_objective`.
       density_weight: of the mean density over all slots, which keeps empty space empty.
       through_weights: whether the geometry is moved to make U likelier too, as published.
+      mesh: see `make_colour_objective`.
     """
-    render = _render_batch(field, background, capacity)
+    render = _render_batch(field, background, capacity, mesh)
 
     def objective(key, params, batch, samples):
         del key
@@ -116,6 +123,7 @@ def make_flow_objective(
     num_draws: int = 32,
     entropy_weight: float = 0.01,
     floor: float = 1e-5,
+    mesh: Mesh | None = None,
 ) -> Callable:
     """Likelihood of the colours under K draws of a distribution over fields (CF-NeRF).
 
@@ -124,20 +132,24 @@ def make_flow_objective(
       background, capacity: see `make_colour_objective`.
       num_draws: K, of the base, shared by all points; new ones in each step.
       entropy_weight, floor: see `flow_loss`.
+      mesh: see `make_colour_objective`.
     """
 
-    def objective(key, params, batch, samples):
-        def render(noise):
-            return render_rays(
-                batch.rays,
-                samples,
-                partial(flow.apply, params, noise=noise),
-                background=background,
-                capacity=capacity,
-                exact=False,
-            )
+    def render(params, noise, batch, samples):
+        return render_rays(
+            batch.rays,
+            samples,
+            partial(flow.apply, params, noise=noise),
+            background=background,
+            capacity=capacity,
+            exact=False,
+        )
 
-        draws = jax.vmap(render)(base_draws(key, num_draws))
+    render_draw = over_rays(render, mesh, spread=(False, False, True, True))
+    render_draws = jax.vmap(render_draw, in_axes=(None, 0, None, None))
+
+    def objective(key, params, batch, samples):
+        draws = render_draws(params, base_draws(key, num_draws), batch, samples)
         ray_mask = draws.ray_mask[0]
         loss = flow_loss(
             draws.rgb,

@@ -10,7 +10,9 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.sharding import Mesh
 
+from bavs_jax.devices import gather_rays, spread_rays
 from bavs_jax.fields.base import Field
 from bavs_jax.rendering.samplers import Sampler
 from bavs_jax.training.batches import sample_pixels
@@ -72,6 +74,7 @@ def make_train_fn(
     num_rays: int,
     penalty_weight: float = 0.0,
     steps_per_call: int = 16,
+    mesh: Mesh | None = None,
 ) -> Callable:
     """Makes the compiled training function.
 
@@ -83,6 +86,7 @@ def make_train_fn(
       num_rays: R, rays of one step.
       penalty_weight: of the field's own penalty.
       steps_per_call: optimiser steps compiled together.
+      mesh: devices that share the rays (see `devices.py`); the objective must have the same.
 
     Returns:
       `train(key, state, table, is_training_view) -> (state, TrainInfo)`: `steps_per_call` steps in
@@ -91,7 +95,7 @@ def make_train_fn(
 
     def loss_fn(params, key, sampler_state, table, is_training_view):
         pixel_key, sample_key, objective_key = jax.random.split(key, 3)
-        batch = sample_pixels(pixel_key, table, is_training_view, num_rays)
+        batch = spread_rays(sample_pixels(pixel_key, table, is_training_view, num_rays), mesh)
         samples, aux = sampler.sample(sample_key, params["sampler"], sampler_state, batch.rays)
         outcome = objective(objective_key, params["field"], batch, samples)
         ray_weight = batch.ray_weight * outcome.ray_mask
@@ -128,8 +132,7 @@ def make_train_fn(
             state,
             jax.random.split(steps_key, steps_per_call),
         )
-        return state, TrainInfo(
-            **jax.tree.map(lambda x: x.astype(jnp.float32).mean(), reports), learning_rate=rate
-        )
+        means = jax.tree.map(lambda x: x.astype(jnp.float32).mean(), reports)
+        return gather_rays((state, TrainInfo(**means, learning_rate=rate)), mesh)
 
     return train

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import jax
 import numpy as np
 
 from bavs_jax.cameras import take
+from bavs_jax.devices import jit_over_rays
 from bavs_jax.rendering.images import render_views
 from bavs_jax.rendering.pixels import basic_images, render_pixels
 from bavs_jax.uncertainty.model import Toolbox
@@ -24,7 +24,6 @@ def make_image_fn(toolbox: Toolbox, kind: str, measures_fn: Callable | None = No
     """
     field, sampler = toolbox.fields[kind]
 
-    @jax.jit
     def images(params, sampler_state, rays):
         rendering, samples = render_pixels(
             field,
@@ -38,7 +37,8 @@ def make_image_fn(toolbox: Toolbox, kind: str, measures_fn: Callable | None = No
         more = {} if measures_fn is None else measures_fn(rendering)
         return {**basic_images(rendering, samples), **more}
 
-    return lambda train, rays: images(train.params, train.sampler_state, rays)
+    compiled = jit_over_rays(images, toolbox.mesh, spread=(False, False, True))
+    return lambda train, rays: compiled(train.params, train.sampler_state, rays)
 
 
 def render_stack(

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+from jax.sharding import Mesh
 
 from bavs_jax.cameras import Cameras
 from bavs_jax.fields.base import Field
@@ -77,7 +78,7 @@ class Toolbox(NamedTuple):
     flow: FlowField  # the distribution whose mean is the field of kind FLOW
     kind: str  # of the field that is trained and measured in this run
     background: Any  # [3], or None (see `composite_colour`)
-    capacity: int  # places of the buffer in which samples are evaluated when rendering
+    capacity: int  # places of each device's buffer in which samples are evaluated when rendering
     grid: DeformationGrid
     laplace: LaplaceOptions
     group_size: int  # views whose curvatures are made at once, each a dense [G, 3]
@@ -87,6 +88,7 @@ class Toolbox(NamedTuple):
     chunk: int = 4096  # rays of one compiled call
     ensemble_size: int = 3  # fields, the run's own among them
     num_draws: int = 32  # of the distribution over fields
+    mesh: Mesh | None = None  # devices that share the rays (see `devices.py`)
 
 
 class Situation(NamedTuple):

@@ -18,8 +18,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from bavs_jax.cameras import Rays
+from bavs_jax.devices import jit_over_rays, num_shards
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.numerics import computed_once
@@ -87,6 +89,7 @@ def make_predictive_fn(
     *,
     background,
     chunk_samples: int = 8192,
+    mesh: Mesh | None = None,
 ) -> Callable:
     """Makes `render(params, sampler_state, variance [G, 3], rays [R]) -> images`.
 
@@ -97,17 +100,16 @@ def make_predictive_fn(
 
     Args:
       field, sampler, grid, background: see `make_curvature_fn`.
-      chunk_samples: slots of one compiled call.
+      chunk_samples: slots of one compiled call, on each device.
+      mesh: devices that share the rays (see `devices.py`).
     """
     buckets = bucket_sizes(sampler)
     background = None if background is None else jnp.asarray(background, jnp.float32)
 
-    @jax.jit
     def count_samples(params, sampler_state, rays):
         samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
         return samples.sample_mask.sum(-1)
 
-    @partial(jax.jit, static_argnames="bucket")
     def render_bucket(params, sampler_state, variance, rays, *, bucket):
         samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
         samples = first_slots(samples, bucket)
@@ -129,13 +131,21 @@ def make_predictive_fn(
             "depth_uncertainty": deviation[1],
         }
 
+    count_fn = jit_over_rays(count_samples, mesh, spread=(False, False, True))
+    bucket_fns = {
+        bucket: jit_over_rays(
+            partial(render_bucket, bucket=bucket), mesh, spread=(False, False, False, True)
+        )
+        for bucket in buckets
+    }
+
     def render(params, sampler_state, variance, rays: Rays) -> dict[str, np.ndarray]:
         num = len(rays.origins)
-        counts = np.asarray(count_samples(params, sampler_state, rays))
+        counts = np.asarray(count_fn(params, sampler_state, rays))
         images, rays = _empty_images(num, background), jax.tree.map(np.asarray, rays)
-        for bucket, rows, count in bucketed_rows(counts, buckets, chunk_samples):
+        for bucket, rows, count in bucketed_rows(counts, buckets, chunk_samples, num_shards(mesh)):
             some = jax.tree.map(lambda x, rows=rows: x[rows], rays)
-            found = render_bucket(params, sampler_state, variance, some, bucket=bucket)
+            found = bucket_fns[bucket](params, sampler_state, variance, some)
             for name, values in found.items():
                 images[name][rows[:count]] = np.asarray(values)[:count]
         return images

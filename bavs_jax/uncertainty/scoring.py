@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from bavs_jax.cameras import Cameras, rescale
+from bavs_jax.devices import jit_over_rays
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.rendering.images import render_views
@@ -26,15 +27,17 @@ def make_render_chunk_fn(
     variant: str,
     scale: str,
     extent: str = "box",
+    mesh: Mesh | None = None,
 ) -> Callable:
     """Makes the compiled rendering of a chunk of rays, uncertainty included (Fig 4).
+
+    The devices of a `mesh` (see `devices.py`) share the rays; each has a buffer of `capacity`.
 
     Returns:
       `render_chunk(params, sampler_state, variance [G], rays [R]) -> {"rgb" [R, 3], "depth" [R],
       "opacity" [R], "thinned" [R], "uncertainty" [R]}`; without the last where `variance` is None.
     """
 
-    @jax.jit
     def render_chunk(params, sampler_state, variance, rays):
         channels = {}
         if variance is not None:
@@ -56,7 +59,7 @@ def make_render_chunk_fn(
             images[name] = finish_uncertainty(value, scale=scale)
         return images
 
-    return render_chunk
+    return jit_over_rays(render_chunk, mesh, spread=(False, False, False, True))
 
 
 def reduced_cameras(cameras: Cameras, image_scale: float) -> Cameras:

@@ -8,7 +8,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
+from bavs_jax.devices import gather_rays, jit_over_rays, num_shards, over_rays, spread_rays
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.rendering.samplers import Sampler
@@ -48,21 +50,26 @@ def bucket_sizes(sampler: Sampler, sizes: tuple[int, ...] = (8, 16, 32, 64)) -> 
     return (*(() if sampler.dense else sorted(b for b in sizes if b < slots)), slots)
 
 
-def bucketed_rows(counts: np.ndarray, buckets: tuple[int, ...], chunk_samples: int):
-    """Rays by bucket: yields (bucket, rows [chunk_samples // bucket], how many of them are true).
+def bucketed_rows(
+    counts: np.ndarray, buckets: tuple[int, ...], chunk_samples: int, num_shards: int = 1
+):
+    """Rays by bucket: yields (bucket, rows, how many of them are true).
+
+    There are `chunk_samples // bucket` rows for each of the shards.
 
     Rays of no samples are left out; the last rows of a bucket are filled up with copies.
 
     Args:
       counts: [N] samples of each ray.
       buckets: ascending, from `bucket_sizes`.
-      chunk_samples: slots of one compiled call.
+      chunk_samples: slots of one compiled call, on each device.
+      num_shards: devices that share the rows.
     """
     smaller = 0
     for bucket in buckets:
         members = np.flatnonzero((counts > smaller) & (counts <= bucket))
         smaller = bucket
-        for rows, num in _chunks(members, max(chunk_samples // bucket, 1)):
+        for rows, num in _chunks(members, num_shards * max(chunk_samples // bucket, 1)):
             yield bucket, rows, num
 
 
@@ -75,6 +82,7 @@ def make_curvature_fn(
     weighting: str = "eq13",
     buckets: tuple[int, ...] = (8, 16, 32, 64),
     chunk_samples: int = 8192,
+    mesh: Mesh | None = None,
 ) -> Callable:
     """Makes the streamed raw Jacobian sum (Eqs 10-13) over given pixels.
 
@@ -89,7 +97,9 @@ def make_curvature_fn(
       background: [3] colour behind everything, or None (see `composite_colour`).
       weighting: one of `curvature.WEIGHTINGS`.
       buckets: sample slots of each compiled shape; the sampler's `num_slots` is added if larger.
-      chunk_samples: slots of one compiled call.
+      chunk_samples: slots of one compiled call, on each device.
+      mesh: devices that share the rays (see `devices.py`); each has a sum of its own, and these are
+        added at the end.
 
     Returns:
       `curvature(params, sampler_state, table, view_ids [N], within [N], progress_fn=None, *,
@@ -99,23 +109,23 @@ def make_curvature_fn(
     """
     slots, buckets = sampler.num_slots, bucket_sizes(sampler, buckets)
     background = None if background is None else jnp.asarray(background, jnp.float32)
-    count_chunk = 8192
+    shards = num_shards(mesh)
+    count_chunk = 8192 * shards
 
-    @jax.jit
-    def count_samples(params, sampler_state, table, view_ids, within):
+    def count_rays(params, sampler_state, table, view_ids, within):
         rays = view_pixel_rays(table.cameras, view_ids, within)
         samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
         return samples.sample_mask.sum(-1)
 
-    @partial(jax.jit, static_argnames="bucket", donate_argnums=0)
-    def add_chunk(
-        total, params, sampler_state, table, view_ids, within, group_ids, ray_weight, *, bucket
-    ):
+    count_samples = jit_over_rays(count_rays, mesh, spread=(False, False, False, True, True))
+
+    def add_part(totals, params, sampler_state, table, *rows, bucket):
+        view_ids, within, group_ids, ray_weight = rows
         rays = view_pixel_rays(table.cameras, view_ids, within)
         samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
         samples = first_slots(samples, bucket)
-        return add_jac_sq_sum(
-            total,
+        total = add_jac_sq_sum(
+            totals[0],
             partial(field.apply, params["field"]),
             grid,
             rays,
@@ -127,6 +137,20 @@ def make_curvature_fn(
             weighting=weighting,
             inputs=field.inputs(rays, samples, view_ids),
         )
+        return total[None]
+
+    @partial(jax.jit, static_argnames="bucket", donate_argnums=0)
+    def add_chunk(totals, *args, bucket):
+        spread = (True, False, False, False, True, True, True, True)
+        return over_rays(partial(add_part, bucket=bucket), mesh, spread=spread)(totals, *args)
+
+    @partial(jax.jit, static_argnames="num_groups")
+    def fresh_totals(num_groups):
+        return spread_rays(jnp.zeros((shards, num_groups * grid.num_vertices, 3)), mesh)
+
+    @jax.jit
+    def add_shards(totals):
+        return gather_rays(totals.sum(0), mesh)
 
     def all_counts(params, sampler_state, table, view_ids, within):
         if sampler.dense:
@@ -150,13 +174,13 @@ def make_curvature_fn(
     ):
         if group_ids is None:
             group_ids = np.zeros(len(view_ids), np.int32)
-        total = jnp.zeros((num_groups * grid.num_vertices, 3))
+        totals = fresh_totals(num_groups)
         counts = all_counts(params, sampler_state, table, view_ids, within)
         report = progress_fn or (lambda num: None)
         report(int((counts == 0).sum()))
-        for bucket, rows, num in bucketed_rows(counts, buckets, chunk_samples):
-            total = add_chunk(
-                total,
+        for bucket, rows, num in bucketed_rows(counts, buckets, chunk_samples, shards):
+            totals = add_chunk(
+                totals,
                 params,
                 sampler_state,
                 table,
@@ -167,8 +191,9 @@ def make_curvature_fn(
                 bucket=bucket,
             )
             # The host would otherwise run ahead and queue every chunk's buffers at once.
-            jax.block_until_ready(total)
+            jax.block_until_ready(totals)
             report(num)
+        total = totals[0] if mesh is None else add_shards(totals)
         return total.reshape(num_groups, grid.num_vertices, 3)
 
     return curvature

@@ -6,6 +6,7 @@ from functools import partial
 
 import jax
 
+from bavs_jax.devices import jit_over_rays
 from bavs_jax.fields.flow_field import base_draws
 from bavs_jax.rendering.pixels import basic_images, render_pixels
 from bavs_jax.uncertainty.disagreement import colour_variance
@@ -23,7 +24,6 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
     field, sampler = toolbox.fields[FLOW]
     noise = base_draws(jax.random.key(DRAWS_SEED), toolbox.num_draws, with_mean=True)
 
-    @jax.jit
     def images(params, sampler_state, rays):
         def render(noise):
             drawn = field._replace(apply=partial(toolbox.flow.apply, noise=noise))
@@ -45,6 +45,8 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
             "depth_uncertainty": draws["depth"].var(0),
         }
 
+    compiled = jit_over_rays(images, toolbox.mesh, spread=(False, False, True))
+
     def fit(key, situation):
         if toolbox.kind == FLOW:
             return None
@@ -52,7 +54,7 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
 
     def render(fitted, train, rays):
         state = train if fitted is None else fitted
-        return images(state.params, state.sampler_state, rays)
+        return compiled(state.params, state.sampler_state, rays)
 
     return ModelFns(fit, render)
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.cameras import Cameras
+from bavs_jax.devices import jit_over_rays
 from bavs_jax.rendering.pixels import basic_images, render_pixels
 from bavs_jax.rendering.render import Channel
 from bavs_jax.uncertainty.coverage import direction_novelty
@@ -30,7 +31,6 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
     field, sampler = toolbox.fields[toolbox.kind]
     depth_images = make_image_fn(toolbox, toolbox.kind)
 
-    @jax.jit
     def images(params, sampler_state, covered, rays):
         novelty = partial(
             direction_novelty,
@@ -49,6 +49,8 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
             channels={"uncertainty": Channel(novelty)},
         )
         return {**basic_images(rendering, samples), **rendering.channels}
+
+    compiled = jit_over_rays(images, toolbox.mesh, spread=(False, False, False, True))
 
     def look(train, cameras, mask):
         return render_stack(
@@ -88,7 +90,7 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
         return covered._replace(mask=mask, depth_maps=covered.depth_maps + images[1])
 
     def render(covered, train, rays):
-        return images(train.params, train.sampler_state, covered, rays)
+        return compiled(train.params, train.sampler_state, covered, rays)
 
     return ModelFns(fit, render, condition)
 

@@ -40,6 +40,7 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
         variant=options.variant,
         scale=options.scale,
         extent=options.extent,
+        mesh=toolbox.mesh,
     )
 
     def fit(key, situation):

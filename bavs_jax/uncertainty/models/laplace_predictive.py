@@ -15,7 +15,9 @@ from bavs_jax.uncertainty.predictive import make_predictive_fn
 def make_fns(toolbox: Toolbox) -> ModelFns:
     """The variances [G, 3] of the offsets are what is fitted."""
     field, sampler = toolbox.fields[toolbox.kind]
-    render_rays = make_predictive_fn(field, sampler, toolbox.grid, background=toolbox.background)
+    render_rays = make_predictive_fn(
+        field, sampler, toolbox.grid, background=toolbox.background, mesh=toolbox.mesh
+    )
     offset_std = toolbox.laplace.offset_cells * cell_sides(toolbox.grid)
 
     def fit(key, situation):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from functools import partial
 
-import jax
 import numpy as np
 
+from bavs_jax.devices import jit_over_rays
 from bavs_jax.uncertainty.images import make_image_fn, render_stack
 from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
 from bavs_jax.uncertainty.warp import WarpSources, warp_disagreement
@@ -16,9 +16,8 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
     """Renders of the training views are fitted."""
     images = make_image_fn(toolbox, toolbox.kind)
 
-    @jax.jit
-    def disagreement(rays, rgb, depth, opacity, sources):
-        return warp_disagreement(rays, rgb, depth, opacity, sources)
+    spread = (True, True, True, True, False)
+    disagreement = jit_over_rays(warp_disagreement, toolbox.mesh, spread=spread)
 
     def fit(key, situation):
         del key
