@@ -58,6 +58,7 @@ class Problem(NamedTuple):
     calls_per_round: int
     has_empty_views: bool  # whether the table has room for pictures taken on the way
     first_empty_row: int  # of the pixel table
+    num_devices: int  # that share the rays
 
 
 def check_choices(config) -> None:
@@ -246,6 +247,7 @@ def build_problem(
         calls_per_round=calls_per_round(config),
         has_empty_views=_has_empty_views(scene, table),
         first_empty_row=int(scene.offsets[-1]),
+        num_devices=num_shards(mesh),
     )
 
 

@@ -242,6 +242,7 @@ class Run:
             "config": self.config.to_dict(),
             "versions": versions(),
             "device": device_name(),
+            "num_devices": self.problem.num_devices,
             "peak_memory_mb": peak_memory_mb(),
             "completed": completed,
             "lpips_reason": self.problem.lpips_reason,
