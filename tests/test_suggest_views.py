@@ -18,7 +18,7 @@ from bavs_jax.placement.seen import count_seeing
 from bavs_jax.scenes.poses import user_transforms
 from bavs_jax.selection.context import SelectionError
 from bavs_jax.selection.worth import Worth
-from experiments.suggest import choosing, exports, facts, page, places, settings
+from experiments.suggest import choosing, exports, facts, places, settings, words
 from tests.scene_files import orbit, write_nerfstudio
 from tests.toy_scenes import toy_scene
 
@@ -169,15 +169,15 @@ def test_photos_see_what_is_before_them_and_not_behind_the_ball():
 
 def test_worth_in_words():
     worth = Worth(np.array([50.0, 30.0]), np.array([60.0, 55.0, 45.0]))
-    words = page.worth_sentence(worth, 40.0)
-    assert "75% of what the best would have told before (60 nats)" in words
-    assert "would tell 67%" in words
-    assert "less and less" in words
-    assert "good place to stop" in page.worth_sentence(worth, 44.0)
-    assert "still worth taking" in page.worth_sentence(worth, 10.0)
-    assert "no more than another photo" in page.worth_sentence(worth, 70.0)
+    sentence = words.worth_sentence(worth, 40.0)
+    assert "75% of what the best would have told before (60 nats)" in sentence
+    assert "would tell 67%" in sentence
+    assert "less and less" in sentence
+    assert "good place to stop" in words.worth_sentence(worth, 44.0)
+    assert "still worth taking" in words.worth_sentence(worth, 10.0)
+    assert "no more than another photo" in words.worth_sentence(worth, 70.0)
     nothing_left = Worth(np.array([60.0]), np.array([60.0, np.nan]))
-    assert "No candidate is left" in page.worth_sentence(nothing_left, 40.0)
+    assert "No candidate is left" in words.worth_sentence(nothing_left, 40.0)
 
 
 # --- files ---

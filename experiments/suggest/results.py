@@ -17,14 +17,11 @@ from experiments.build import RENDER_CHUNK, Problem
 from experiments.files import write_json
 from experiments.machine import device_name, peak_memory_mb
 from experiments.progress import track
-from experiments.report.tables import Cell, Table
-from experiments.suggest import exports, page, plots
+from experiments.suggest import exports, page, plots, words
 from experiments.suggest.choosing import Suggestion, photo_rays
 from experiments.suggest.facts import length, pose_facts
 from experiments.suggest.places import Surroundings, photos_in_matter
 from experiments.suggest.settings import Options
-
-MANY_IN_MATTER = 0.1  # share of the photos inside of "matter" from which the page warns
 
 
 def visiting_order(places, options: Options, last_photo) -> tuple[np.ndarray, str]:
@@ -42,12 +39,12 @@ def visiting_order(places, options: Options, last_photo) -> tuple[np.ndarray, st
     found = route_length(start, places, order)
     before = route_length(start, places, np.arange(len(places)))
     origin = "the last photo" if options.start is None else "the given start"
-    words = (
+    route = (
         f"The poses are numbered along a route of {length(found)} from {origin} "
         f"({', '.join(f'{x:.3g}' for x in start)}); in the order of picking it would be "
         f"{length(before)}."
     )
-    return order, words
+    return order, route
 
 
 def make_rows(suggestion: Suggestion, order) -> list[dict]:
@@ -160,10 +157,10 @@ def write_results(
         photo_uncertainty=pixels,
         density_fn=density_fn,
     )
-    worth_words = page.worth_sentence(suggestion.worth, suggestion.photo_gain)
+    worth_words = words.worth_sentence(suggestion.worth, suggestion.photo_gain)
     foggy = photos_in_matter(scene, density_fn, around)
 
-    cards_rows = [row | {"place": _place_words(pose)} for row, pose in zip(rows, poses)]
+    cards_rows = [row | {"place": words.place_words(pose)} for row, pose in zip(rows, poses)]
     cards, bar = page.preview_cards(images, cards_rows, [f.sentence() for f in facts])
     start = options.start if options.start is not None else photo_places[-1]
     width, height = (int(n) for n in picked_cameras.sizes[0])
@@ -171,9 +168,9 @@ def write_results(
     page.write_page(
         files["report"],
         title=scene.name,
-        headline=_headline(scene, suggestion, proposals),
+        headline=words.headline(scene, suggestion, proposals),
         worth=worth_words,
-        warnings=_warnings(scene, around, facts, foggy),
+        warnings=words.warnings(scene, around, facts, foggy),
         route=route_words,
         cards=cards,
         bar=bar,
@@ -190,11 +187,11 @@ def write_results(
             order=options.route,
             start=around.to_scene(start) if options.route else None,
         ),
-        candidates=_candidate_words(options, proposals, suggestion, around),
+        candidates=words.candidate_words(options, proposals, suggestion, around),
         worth_curve=plots.worth_plot(suggestion.worth, suggestion.photo_gain),
-        numbers=_numbers(rows, poses, facts),
+        numbers=words.numbers(rows, poses, facts),
         command=command,
-        details=_details(problem, options, around, quality, foggy, seconds_fn()),
+        details=words.details(problem, options, around, quality, foggy, seconds_fn()),
     )
     made = {
         "scene": scene.name,
@@ -207,98 +204,6 @@ def write_results(
         folder / "suggestion.json", suggestion, proposals, rows, facts, worth_words, made
     )
     return files
-
-
-def _headline(scene, suggestion: Suggestion, proposals: Proposals) -> str:
-    num, total = len(suggestion.selected), len(proposals.poses)
-    poses = "pose" if num == 1 else "poses"
-    return (
-        f"The {num} {poses} to photograph next, chosen from {total} free places around "
-        f"{scene.num_views} photos."
-    )
-
-
-def _warnings(scene, around: Surroundings, facts, foggy: int) -> list[str]:
-    words = []
-    if foggy > MANY_IN_MATTER * scene.num_views:
-        words.append(
-            f"{foggy} of {scene.num_views} photos stand in what the field takes for matter: it has "
-            "fog in front of the cameras, so free places are turned away too. Train longer "
-            "(--train_steps)."
-        )
-    unseen = sum(f.num_seeing == 0 for f in facts)
-    if unseen:
-        words.append(
-            f"{unseen} of {len(facts)} poses stand where no photo looks. What the field says of "
-            "such places is a guess: make sure that they are free before you send a robot there."
-        )
-    if not around.faces_focus:
-        words.append(
-            "The photos look outwards, so that they have no common point in front of them: shell "
-            "candidates look where the photos near them look."
-        )
-    return words
-
-
-def _candidate_words(options, proposals, suggestion, around: Surroundings) -> str:
-    words = (
-        f"Candidates ({options.candidates}): {proposals.in_words()}. Matter: half of the light "
-        f"lost within {length(np.log(2.0) / around.solid_density * around.unit)}; clearance "
-        f"{length(around.clearance * around.unit)}."
-    )
-    if suggestion.info.filter is not None:
-        words += (
-            f" The distance filter of {options.policy!r} left "
-            f"{int(suggestion.info.survivors.sum())}, at least "
-            f"{length(float(suggestion.info.filter.radii.min_train_distance) * around.unit)} from "
-            "every photo and from each other."
-        )
-    return words
-
-
-def _place_words(pose: np.ndarray) -> str:
-    place = ", ".join(f"{x:.3f}" for x in pose[:3, 3])
-    look = ", ".join(f"{x:.2f}" for x in -pose[:3, 2])
-    return f"at ({place}), looks along ({look})"
-
-
-def _numbers(rows, poses, facts) -> Table:
-    head = ("no.", "picked", "x", "y", "z", "score", "information, of the best", "high pixels")
-    head += ("nearest photo", "photos that see the place")
-    cells = [
-        [
-            str(row["order"]),
-            str(row["picked"]),
-            *(f"{x:.3f}" for x in pose[:3, 3]),
-            f"{row['score']:.3f}",
-            "—" if row["share_of_best"] is None else f"{row['share_of_best']:.0%}",
-            f"{fact.share_high:.0%}",
-            f"{fact.nearest_distance:.3g}",
-            str(fact.num_seeing),
-        ]
-        for row, pose, fact in zip(rows, poses, facts)
-    ]
-    return Table(head, tuple(tuple(map(Cell, row)) for row in cells))
-
-
-def _details(problem, options, around: Surroundings, quality, foggy, seconds) -> list[tuple]:
-    scene = problem.scene
-    width, height = np.asarray(scene.cameras.sizes).max(axis=0)
-    measured = "not measured: no photo was left out (--holdout)"
-    if quality is not None:
-        measured = (
-            f"PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.3f} on "
-            f"{quality['num_test_views']} photos left out"
-        )
-    focus = ", ".join(f"{x:.3f}" for x in around.to_user(around.focus))
-    return [
-        ("photos", f"{len(scene.pool)} to train on, at most {width} x {height} pixels"),
-        ("field", measured),
-        ("policy", options.policy),
-        ("focus", f"({focus}), {length(around.distance * around.unit)} from the photos (median)"),
-        ("photos inside of matter", f"{foggy} of {scene.num_views}"),
-        ("time", f"{seconds:.0f} s"),
-    ]
 
 
 def _write_summary(
