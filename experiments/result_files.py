@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from experiments.bench import results as bench
@@ -59,17 +59,19 @@ FILES: dict[str, Callable[[pathlib.Path], Collected]] = {
 }
 
 
-def collect_all(folder: pathlib.Path, paper: str | None = None) -> list[Collected]:
+def collect_all(
+    folder: pathlib.Path, paper: str | None = None, only: Sequence[str] = ()
+) -> list[Collected]:
     """The tables of every result file that a folder holds.
 
     Args:
       folder: of an experiment, a sweep, or any other script.
-      paper: see `collect_tables`.
+      paper, only: see `run_tables`.
 
     Raises:
       ReportError: it holds none, or one that cannot be used.
     """
     found = [make(folder / name) for name, make in FILES.items() if (folder / name).exists()]
     if not found or any((folder / name).exists() for name in ("summary.json", SWEEP_FILE)):
-        found.insert(0, collect_tables(folder, paper))
+        found.insert(0, collect_tables(folder, paper, only))
     return found

@@ -6,7 +6,8 @@
 The first prints the tables of one experiment or sweep. The second writes every table of a page
 anew: each stands between `<!-- results: FOLDER -->` and `<!-- end of results -->`, where FOLDER
 holds a result file of any script and is relative to the page. On the same line, `tables=quality`
-names which tables, and `paper=table_1` the paper's whose rows are put beside ours.
+names which tables, `policies=bavs,random` which rows, and `paper=table_1` the paper's table whose
+rows are put beside ours.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import pathlib
 import re
 import sys
+from collections.abc import Sequence
 
 from absl import flags
 
@@ -30,6 +32,7 @@ flags.DEFINE_string("workdir", None, "Folder of an experiment or of a sweep: pri
 flags.DEFINE_string("page", None, "Markdown file whose tables are written anew.")
 flags.DEFINE_enum("format", "markdown", [*FORMATS], "Of what --workdir prints.")
 flags.DEFINE_list("tables", None, "Which tables, such as quality,rounds; all by default.")
+flags.DEFINE_list("policies", None, "Whose rows, in this order; by default all.")
 flags.DEFINE_string("paper", None, "Table of the paper to put beside ours, such as table_1.")
 
 MARKED = re.compile(
@@ -43,6 +46,7 @@ def result_tables(
     form: str = "markdown",
     names: list[str] | None = None,
     paper: str | None = None,
+    only: Sequence[str] = (),
 ) -> str:
     """The tables of all result files of a folder, with the commands that made them.
 
@@ -50,12 +54,12 @@ def result_tables(
       folder: where the result files are.
       form: a key of `FORMATS`.
       names: of the tables; None: all.
-      paper: a table of the paper; see `collect_tables`.
+      paper, only: a table of the paper, and the policies that are shown; see `run_tables`.
 
     Raises:
       ReportError: a file that cannot be used, or no such table.
     """
-    found = collect_all(folder, paper)
+    found = collect_all(folder, paper, only)
     known = list(dict.fromkeys(name for one in found for name in one.tables))
     unknown = [name for name in names or () if name not in known]
     if unknown:
@@ -70,11 +74,15 @@ def fill_page(text: str, root: pathlib.Path) -> str:
         head, folder, options, end = match.groups()
         given = dict(option.split("=", 1) for option in options.split())
         names = given.pop("tables", None)
-        paper = given.pop("paper", None)
+        paper, only = given.pop("paper", None), given.pop("policies", None)
         if given:
-            raise ReportError(f"results: {folder}: {next(iter(given))}= is not tables= or paper=")
-        names = names.split(",") if names else None
-        return f"{head}{result_tables(root / folder, names=names, paper=paper)}{end}"
+            raise ReportError(
+                f"results: {folder}: {next(iter(given))}= is not tables=, policies= or paper="
+            )
+        names, only = (text.split(",") if text else None for text in (names, only))
+        return (
+            f"{head}{result_tables(root / folder, names=names, paper=paper, only=only or ())}{end}"
+        )
 
     return MARKED.sub(filled, text)
 
@@ -85,7 +93,8 @@ def main() -> None:
     try:
         if FLAGS.workdir:
             folder, names = pathlib.Path(FLAGS.workdir), FLAGS.tables
-            print(result_tables(folder, form=FLAGS.format, names=names, paper=FLAGS.paper))
+            options = {"names": names, "paper": FLAGS.paper, "only": FLAGS.policies or ()}
+            print(result_tables(folder, form=FLAGS.format, **options))
             return
         page = pathlib.Path(FLAGS.page)
         text = fill_page(page.read_text(encoding="utf-8"), page.parent)

@@ -224,6 +224,19 @@ def test_a_page_names_its_tables(workdir, tmp_path):
         fill_page(f"<!-- results: {workdir} colour=red -->\n<!-- end of results -->", tmp_path)
 
 
+def test_a_page_names_its_rows(tmp_path):
+    runs = [
+        make_result(policy, seed) for policy in ("bavs", "random", "farthest") for seed in (0, 1)
+    ]
+    write_workdir(tmp_path, runs, arrays=False)
+    page = "<!-- results: . tables=quality policies={} -->\n<!-- end of results -->"
+    rows = fill_page(page.format("random,bavs"), tmp_path).splitlines()
+    starts = [row.split("|")[1].strip() for row in rows if row.startswith("|")]
+    assert starts == ["policy", "---", "random", "bavs"]
+    with pytest.raises(ReportError, match="no run of entropy; there are bavs, random, farthest"):
+        fill_page(page.format("entropy"), tmp_path)
+
+
 @pytest.mark.parametrize(
     "page", ["README.md", "experiments/results/README.md", "experiments/results/TRIES.md"]
 )

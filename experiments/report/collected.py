@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+from collections.abc import Sequence
 
 from experiments.report.formats import FORMATS, latex_text
 from experiments.report.paper_table import paper_table
@@ -59,21 +60,25 @@ def collected_text(
     return "\n\n".join(blocks) + "\n"
 
 
-def run_tables(folder: pathlib.Path, paper: str | None = None) -> Collected:
+def run_tables(
+    folder: pathlib.Path, paper: str | None = None, only: Sequence[str] = ()
+) -> Collected:
     """Quality at the last shared number of views, round by round, and where the time went.
 
     Args:
       folder: of one experiment, with its `summary.json`.
       paper: a table of the paper whose rows are put beside ours; see `printed.TABLES`.
+      only: policies to show, in this order; by default all.
 
     Raises:
-      ReportError: a file that cannot be used.
+      ReportError: a file that cannot be used, or one of `only` without a run.
     """
-    runs, record = load_runs(folder), read_record(folder)
+    runs, record = _runs_of(folder, only), read_record(folder)
     policies = list(dict.fromkeys(run.policy for run in runs))
     notes: tuple[str, ...] = ()
     if record is not None:
-        policies = list(dict.fromkeys([*policies, *_setting_row(record, ".")["policies"]]))
+        planned = _setting_row(record, ".")["policies"]
+        policies = list(dict.fromkeys([*policies, *(p for p in planned if not only or p in only)]))
         notes = _missing_notes(record, {".": runs})
     if not runs:
         raise ReportError(f"{folder / 'summary.json'}: holds no run; wait for the first to end")
@@ -103,12 +108,23 @@ def sweep_tables(folder: pathlib.Path) -> Collected:
     return Collected(_made_words(record, done), {"settings": settings_table(settings)}, notes)
 
 
-def collect_tables(folder: pathlib.Path, paper: str | None = None) -> Collected:
+def collect_tables(
+    folder: pathlib.Path, paper: str | None = None, only: Sequence[str] = ()
+) -> Collected:
     """The tables of whatever a folder holds: of a sweep over options, or of one experiment."""
     record = read_record(folder)
     if record is not None and any(row["values"] for row in record.settings):
         return sweep_tables(folder)
-    return run_tables(folder, paper)
+    return run_tables(folder, paper, only)
+
+
+def _runs_of(folder: pathlib.Path, only: Sequence[str]) -> list[Run]:
+    runs = load_runs(folder)
+    known = dict.fromkeys(run.policy for run in runs)
+    for policy in only:
+        if policy not in known:
+            raise ReportError(f"{folder}: no run of {policy}; there are {', '.join(known)}")
+    return [run for policy in only or known for run in runs if run.policy == policy]
 
 
 def _runs_so_far(folder: pathlib.Path) -> list[Run]:
