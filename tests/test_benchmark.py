@@ -152,6 +152,7 @@ def positive(*numbers) -> bool:
     return bool(np.all(np.isfinite(flat)) and np.all(flat > 0))
 
 
+@pytest.mark.slow
 def test_every_number_is_there_and_positive(measured):
     result = json.loads((measured / "benchmark.json").read_text())
     rates = ("train", "render", "curvature")
@@ -171,6 +172,7 @@ def test_every_number_is_there_and_positive(measured):
     assert positive(*result["ceilings"].values())
 
 
+@pytest.mark.slow
 def test_memory_never_shrinks_and_more_samples_are_more_work(measured):
     result = json.loads((measured / "benchmark.json").read_text())
     memory = [stage["peak_memory_so_far_mb"] for stage in result["stages"].values()]
@@ -186,6 +188,7 @@ def test_memory_never_shrinks_and_more_samples_are_more_work(measured):
     assert per_ray["render"] < per_ray["train"] and per_ray["render"] < per_ray["curvature"]
 
 
+@pytest.mark.slow
 def test_growth_has_a_fit_for_each_series(measured):
     growth = json.loads((measured / "benchmark.json").read_text())["growth"]
     assert growth.keys() == {
@@ -202,6 +205,7 @@ def test_growth_has_a_fit_for_each_series(measured):
             assert np.isfinite(list(row["fit"].values())).all()
 
 
+@pytest.mark.slow
 def test_page_tables_and_trace_are_written(measured):
     page = (measured / "benchmark.html").read_text()
     assert page.count("<svg") == 1 + 7 and "scoring candidates" in page

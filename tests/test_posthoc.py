@@ -65,6 +65,7 @@ def is_picture(path):
         return min(image.size) > 300 and np.asarray(image).std() > 0
 
 
+@pytest.mark.slow
 def test_clean_up_trains_measures_and_writes(cleaned):
     folder, out = cleaned
     assert "remaining" in out and f"the end of {POLICY} seed 0, 4 training views" in out
@@ -87,6 +88,7 @@ def test_clean_up_trains_measures_and_writes(cleaned):
     assert all(map(is_picture, pictures.iterdir()))
 
 
+@pytest.mark.slow
 def test_posterior_draws_takes_up_the_run(cleaned):
     folder, _ = cleaned
     flags = (f"--workdir={folder}", "--num_draws=2", "--num_views=2")
@@ -107,6 +109,7 @@ def read_vertices(path):
     return shape.metadata["_ply_raw"]["vertex"]["data"]
 
 
+@pytest.mark.slow
 def test_exported_files_agree_with_the_field(cleaned, run):
     base, _ = cleaned
     flags = ("--resolution=9", "--num_samples=300", "--density_threshold=0.5")
@@ -144,6 +147,7 @@ def test_exported_files_agree_with_the_field(cleaned, run):
     assert geometry["whole"]["chamfer"] > geometry["floor"]["chamfer"] > 0.0
 
 
+@pytest.mark.slow
 def test_a_run_is_taken_up_as_it_was(cleaned, run):
     folder, _ = cleaned
     assert saved_config(folder).to_dict() == toy_config(**OVERRIDES).to_dict()
@@ -156,6 +160,7 @@ def test_a_run_is_taken_up_as_it_was(cleaned, run):
     assert run.pixel_mask(view).all() and run.num_rays == 2 * run.truth(view)[..., 0].size
 
 
+@pytest.mark.slow
 def test_which_runs_are_taken_up(cleaned):
     folder, _ = cleaned
     config = saved_config(folder)
