@@ -18,18 +18,19 @@ from jax.sharding import Mesh
 from ml_collections import config_flags
 
 from bavs_jax.selection.policies import POLICIES
-from experiments import runtime, workdir
+from experiments import compilation, job, runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
 from experiments.errors import USER_ERRORS
 from experiments.files import exclusive
-from experiments.job import start_job
 from experiments.parts import all_parts, find_part
 from experiments.processes import is_first_process
 from experiments.report import write_report
 from experiments.runner import Run
 
 FLAGS = flags.FLAGS
+flags.adopt_module_key_flags(compilation)
+flags.adopt_module_key_flags(job)
 config_flags.DEFINE_config_file(
     "config",
     None,
@@ -43,7 +44,6 @@ flags.DEFINE_string(
 )
 flags.DEFINE_bool("end_with_stdin", False, "Stop when standard input is closed.")
 flags.DEFINE_bool("list_policies", False, "Print the known acquisition policies and stop.")
-flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
 
 
 def make_parts(
@@ -97,13 +97,12 @@ def main() -> None:
         sys.exit("error: --config: is missing; try --config=experiments/configs/quickstart.py")
     if not FLAGS.workdir:
         sys.exit("error: --workdir: is missing; name a folder for the results")
-    if FLAGS.compilation_cache:
-        runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
+    compilation.start_cache()
     if FLAGS.end_with_stdin:
         runtime.end_with_parent()
     config, folder = FLAGS.config, pathlib.Path(FLAGS.workdir)
     try:
-        mesh = start_job()
+        mesh = job.start_job()
         if FLAGS.part is not None:
             make_parts(config, folder, runtime.command_line(), only=FLAGS.part, mesh=mesh)
         else:

@@ -21,7 +21,7 @@ from ml_collections import config_flags
 
 from bavs_jax.uncertainty.conformal_scale import SCALES
 from bavs_jax.uncertainty.models import MODELS
-from experiments import runtime, workdir
+from experiments import compilation, runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
 from experiments.errors import USER_ERRORS, check_choice
@@ -29,6 +29,7 @@ from experiments.uncertain.one_seed import measure_seed
 from experiments.uncertain.summary import write_summary
 
 FLAGS = flags.FLAGS
+flags.adopt_module_key_flags(compilation)
 config_flags.DEFINE_config_file(
     "config",
     None,
@@ -37,7 +38,6 @@ config_flags.DEFINE_config_file(
     lock_config=True,
 )
 flags.DEFINE_string("workdir", None, "Folder for fields, uncertainty.json and uncertainty.html.")
-flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
 
 
 def evaluate(config, folder: pathlib.Path, command: str) -> None:
@@ -62,8 +62,7 @@ def main() -> None:
         sys.exit("error: --config: is missing; try --config=experiments/configs/uncertainty.py")
     if not FLAGS.workdir:
         sys.exit("error: --workdir: is missing; name a folder for the results")
-    if FLAGS.compilation_cache:
-        runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
+    compilation.start_cache()
     try:
         evaluate(FLAGS.config, pathlib.Path(FLAGS.workdir), runtime.command_line())
     except USER_ERRORS as error:

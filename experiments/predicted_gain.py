@@ -18,18 +18,18 @@ import sys
 
 from absl import flags
 
-from experiments import runtime
+from experiments import compilation, runtime
 from experiments.errors import USER_ERRORS
 from experiments.predicted.compare import PAGE_FILE, compare
 from experiments.predicted.results import RESULT_FILE
 from experiments.report import ReportError
 
 FLAGS = flags.FLAGS
+flags.adopt_module_key_flags(compilation)
 flags.DEFINE_multi_string("workdir", [], "Folder of an experiment; may be given several times.")
 flags.DEFINE_list("policies", [], "Whose runs to read; by default all.")
 flags.DEFINE_bool("planned", False, "Predict all batches from the field of the initial views.")
 flags.DEFINE_string("out", None, "Folder for the results; by default the first --workdir.")
-flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
 
 
 def main() -> None:
@@ -37,8 +37,7 @@ def main() -> None:
         sys.exit("error: --workdir: is missing; name the folder of a finished experiment")
     folders = [pathlib.Path(folder) for folder in FLAGS.workdir]
     out = pathlib.Path(FLAGS.out) if FLAGS.out else folders[0]
-    if FLAGS.compilation_cache:
-        runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
+    compilation.start_cache()
     try:
         result = compare(
             *(folders, out),

@@ -17,12 +17,13 @@ from absl import flags
 from ml_collections import config_flags
 
 from bavs_jax.scenes import load_scene
-from experiments import runtime, workdir
+from experiments import compilation, runtime, workdir
 from experiments.build import build_problem
 from experiments.errors import USER_ERRORS
 from experiments.suggest import choosing, places, results, settings, training
 
 FLAGS = flags.FLAGS
+flags.adopt_module_key_flags(compilation)
 flags.DEFINE_string("data", None, "Folder of the capture, in any layout that can be loaded.")
 flags.DEFINE_string("workdir", None, "Folder for poses, checkpoints and report.html.")
 flags.DEFINE_integer("num_views", 10, "How many poses to propose.")
@@ -48,7 +49,6 @@ flags.DEFINE_float("gaze_jitter", 8.0, "Degrees by which shell and box poses loo
 flags.DEFINE_float("score_scale", 0.25, "Size of the images that are scored, as a share.")
 flags.DEFINE_bool("route", False, "Order the poses along a short route.")
 flags.DEFINE_string("start", "", "x,y,z where the route begins; default: at the last photo.")
-flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
 
 
 def read_options() -> settings.Options:
@@ -137,8 +137,7 @@ def main() -> None:
     for name, hint in (("data", "folder of the capture"), ("workdir", "folder for the results")):
         if not FLAGS[name].value:
             sys.exit(f"error: --{name}: is missing; name a {hint}")
-    if FLAGS.compilation_cache:
-        runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
+    compilation.start_cache()
     try:
         suggest_views(pathlib.Path(FLAGS.data), pathlib.Path(FLAGS.workdir), read_options())
     except USER_ERRORS as error:

@@ -17,7 +17,7 @@ import sys
 from absl import flags
 from ml_collections import config_flags
 
-from experiments import runtime, workdir
+from experiments import compilation, runtime, workdir
 from experiments.build import check_choices
 from experiments.errors import USER_ERRORS
 from experiments.report import ReportError, write_report
@@ -31,6 +31,7 @@ from experiments.sweeps.run import run_trials
 from experiments.sweeps.schedule import Engine
 
 FLAGS = flags.FLAGS
+flags.adopt_module_key_flags(compilation)
 config_flags.DEFINE_config_file(
     "config", None, "What to run; see experiments.active_selection.", lock_config=True
 )
@@ -46,7 +47,6 @@ flags.DEFINE_integer(
 flags.DEFINE_float("gb_per_trial", 2.0, "local: host memory that a trial needs.", 0.1)
 flags.DEFINE_string("ray_address", None, "ray: the cluster; the one this machine is in by default.")
 flags.DEFINE_integer("retries", 2, "How often a trial is started again whose worker died.", 0)
-flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
 
 
 def make_engine() -> Engine:
@@ -100,7 +100,7 @@ def sweep(config, folder: pathlib.Path, given: list[str]) -> int:
     """The whole sweep; returns how many trials failed."""
     settings = make_settings(config, parse_axes(FLAGS.axis, config), folder)
     record = claim_folders(settings, folder)
-    trials = [t for s in settings for t in make_trials(s, given, cache=FLAGS.compilation_cache)]
+    trials = [t for s in settings for t in make_trials(s, given, compilation.as_flags())]
     planned = sum(part.policy is not None for s in settings for part in s.parts)
     left = sum(trial.part.policy is not None for trial in trials)
     print(f"trials: {planned}, finished before: {planned - left}", flush=True)

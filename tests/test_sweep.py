@@ -183,13 +183,13 @@ def test_a_trial_is_a_single_run_of_one_part_and_shares_round_0(tmp_path):
     first, second = make_settings(config, axes, tmp_path)
     assert (first.config.batch_size, second.config.batch_size, config.batch_size) == (2, 4, 4)
     assert first.folder == tmp_path / "batch_size=2"
-    trials = make_trials(first, ["--config=c.py"])
+    trials = make_trials(first, ["--config=c.py"], ["--compilation_cache_dir=c"])
     assert [t.part.name for t in trials] == ["initial/seed_4", "random/seed_4", "bavs/seed_4"]
     assert [t.job.needs for t in trials] == [None, *[f"{first.folder}/initial/seed_4"] * 2]
     argv = trials[1].job.argv
     assert argv[:3] == ("-m", "experiments.active_selection", "--config=c.py")
     assert "--config.policies=('random', 'bavs')" in argv and "--config.batch_size=2" in argv
-    assert "--part=random/seed_4" in argv
+    assert "--part=random/seed_4" in argv and "--compilation_cache_dir=c" in argv
     done = first.folder / "random" / "seed_4"
     done.mkdir(parents=True)
     (done / "result.json").write_text('{"completed": true}')

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from absl import flags
 from ml_collections import config_flags
 
-from experiments import runtime, workdir
+from experiments import compilation, runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
 from experiments.errors import USER_ERRORS, ConfigError
@@ -31,6 +31,7 @@ from experiments.trained import (
 SCHEMA_VERSION = 1
 
 FLAGS = flags.FLAGS
+flags.adopt_module_key_flags(compilation)
 config_flags.DEFINE_config_file(
     "config",
     None,
@@ -47,7 +48,6 @@ flags.DEFINE_string(
 )
 flags.DEFINE_integer("seed", None, "Of which seed; by default all seeds of that policy.")
 flags.DEFINE_string("data_dir", "", "Folder of scenes, if it has moved since the run.")
-flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
 
 
 def check_flags(*rules: tuple[str, bool, str]) -> None:
@@ -128,8 +128,7 @@ def run_on_trained(work: Callable[[], None]) -> None:
     def main() -> None:
         if not FLAGS.workdir:
             sys.exit("error: --workdir: is missing; name the folder of a run")
-        if FLAGS.compilation_cache:
-            runtime.use_compilation_cache(runtime.cache_folder() / "compiled")
+        compilation.start_cache()
         try:
             work()
         except OSError as error:

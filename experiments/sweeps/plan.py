@@ -53,13 +53,15 @@ def make_settings(config, axes: Axes, workdir: pathlib.Path) -> list[Setting]:
     return made
 
 
-def make_trials(setting: Setting, config_flags: list[str], *, cache: bool = True) -> list[Trial]:
+def make_trials(
+    setting: Setting, config_flags: list[str], cache_flags: list[str] | None = None
+) -> list[Trial]:
     """A trial for each part that is not finished, and for the round 0 that such a part needs.
 
     Args:
       setting: the experiment.
       config_flags: what the user gave of the config, as flags.
-      cache: whether compiled programs are kept.
+      cache_flags: where compiled programs are kept, as flags; by default where a script would.
     """
     left = [p for p in setting.parts if p.policy and not is_finished(setting.folder, p)]
     wanted = {part for p in left for part in (p, p.initial)}
@@ -71,7 +73,7 @@ def make_trials(setting: Setting, config_flags: list[str], *, cache: bool = True
         argv = (*SCRIPT, *shared, f"--workdir={setting.folder}", f"--part={part.name}")
         job = Job(
             name=f"{setting.folder / part.name}",
-            argv=(*argv, "--end_with_stdin", f"--compilation_cache={cache}"),
+            argv=(*argv, "--end_with_stdin", *(cache_flags or ())),
             log=setting.folder / part.name / "log.txt",
             is_finished=partial(is_finished, setting.folder, part),
             needs=f"{setting.folder / part.initial.name}" if part.policy else None,
