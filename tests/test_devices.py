@@ -35,7 +35,7 @@ def start(module, *arguments, num_devices=1):
 def finish(*processes):
     """Their output; all are ended if one fails."""
     try:
-        outputs = [process.communicate(timeout=400)[0] for process in processes]
+        outputs = [process.communicate(timeout=900)[0] for process in processes]
     finally:
         for process in processes:
             process.kill()
