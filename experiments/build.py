@@ -24,10 +24,11 @@ from bavs_jax.selection.policy import MODES
 from bavs_jax.sources import SourceOptions, make_sources_fn
 from bavs_jax.training.batches import PixelTable, make_pixel_table
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.channel import EXTENTS, SCALES, VARIANTS, vertex_variance
+from bavs_jax.uncertainty.channel import EXTENTS, SCALES, VARIANTS
 from bavs_jax.uncertainty.curvature import WEIGHTINGS
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, LaplaceOptions, Toolbox
 from bavs_jax.uncertainty.models import MODELS
+from bavs_jax.uncertainty.models.laplace import laplace_variance
 from bavs_jax.uncertainty.posterior import default_prior_weight
 from bavs_jax.uncertainty.scoring import make_render_chunk_fn
 from bavs_jax.uncertainty.streaming import curvature_group_size, make_curvature_fn
@@ -129,13 +130,7 @@ def build_problem(
     def render(state: TrainState, jac_sq_sum=None, num_rays: int = 0):
         if jac_sq_sum is None:
             return partial(render_chunk, state.params, state.sampler_state, None)
-        variance = vertex_variance(
-            jac_sq_sum,
-            num_rays=num_rays,
-            prior_weight=laplace.prior_weight,
-            weighting=laplace.weighting,
-            variant=laplace.variant,
-        )
+        variance = laplace_variance(jac_sq_sum, num_rays, laplace)
         return partial(render_chunk, state.params, state.sampler_state, variance)
 
     @jax.jit

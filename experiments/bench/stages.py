@@ -15,7 +15,7 @@ from bavs_jax.selection.batch import make_select_batch_fn
 from bavs_jax.selection.context import Context, make_context
 from bavs_jax.training.batches import view_pixel_rays
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.channel import vertex_variance
+from bavs_jax.uncertainty.models.laplace import laplace_variance
 from bavs_jax.uncertainty.scoring import mean_uncertainty
 from experiments.bench import work
 from experiments.bench.ceilings import Ceilings
@@ -208,13 +208,7 @@ def measure_scoring(subject: Subject, state: TrainState, jac_sq_sum, sizes) -> S
     within = rng.integers(0, num_pixels(cameras)[view_ids])
     rays = jax.jit(view_pixel_rays)(jax.tree.map(np.asarray, cameras), view_ids, within)
     num_samples = max(int(subject.count_samples(state, rays).sum()), 1)
-    variance = vertex_variance(
-        jac_sq_sum,
-        num_rays=num_rays,
-        prior_weight=options.prior_weight,
-        weighting=options.weighting,
-        variant=options.variant,
-    )
+    variance = laplace_variance(jac_sq_sum, num_rays, options)
     chunk = work.rendering_work(subject, state, rays, num_samples, variance)
     run = make_scoring_run(subject, state, jac_sq_sum, num_rays, cameras)
     return _measure(

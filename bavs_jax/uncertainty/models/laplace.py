@@ -7,7 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.uncertainty.channel import vertex_variance
-from bavs_jax.uncertainty.model import ModelFns, Situation, Toolbox, UncertaintyModel
+from bavs_jax.uncertainty.model import (
+    LaplaceOptions,
+    ModelFns,
+    Situation,
+    Toolbox,
+    UncertaintyModel,
+)
 from bavs_jax.uncertainty.scoring import make_render_chunk_fn
 from bavs_jax.uncertainty.streaming import training_pixels
 
@@ -24,6 +30,17 @@ def training_curvature(key, toolbox: Toolbox, situation: Situation, weighting: s
     label = f"{situation.label}: curvature"
     return scale * toolbox.curvature(
         situation.train, situation.table, view_ids, within, label, weighting=weighting
+    )
+
+
+def laplace_variance(jac_sq_sum: jax.Array, num_rays, options: LaplaceOptions) -> jax.Array:
+    """`vertex_variance` [G] under a scene's options, scene unit^2."""
+    return vertex_variance(
+        jac_sq_sum,
+        num_rays=num_rays,
+        prior_weight=options.prior_weight,
+        weighting=options.weighting,
+        variant=options.variant,
     )
 
 
@@ -45,13 +62,7 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
 
     def fit(key, situation):
         jac_sq_sum = training_curvature(key, toolbox, situation, options.weighting)
-        variance = vertex_variance(
-            jac_sq_sum,
-            num_rays=situation.num_rays,
-            prior_weight=options.prior_weight,
-            weighting=options.weighting,
-            variant=options.variant,
-        )
+        variance = laplace_variance(jac_sq_sum, situation.num_rays, options)
         return jax.block_until_ready(jnp.asarray(variance))
 
     def render(fitted, train, rays):
