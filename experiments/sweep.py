@@ -5,7 +5,8 @@
 
 An axis is `policy`, `seed` or an option of the config, such as
 --axis=config.uncertainty.log2_cells=5,6,7; each setting of options has a folder of its own, as a
-single run would make it. Started again, a sweep goes on: what is finished is not run again.
+single run would make it. With --change in place of --axis, options are changed one at a time, as
+ablations do. Started again, a sweep goes on: what is finished is not run again.
 """
 
 from __future__ import annotations
@@ -38,6 +39,9 @@ config_flags.DEFINE_config_file(
 flags.DEFINE_string("workdir", None, "Folder for all results.")
 flags.DEFINE_multi_string(
     "axis", [], "What to vary: name=value,value or seed=0:5; may be repeated."
+)
+flags.DEFINE_multi_string(
+    "change", [], "As --axis, but each value alone, beside the config as it is; may be repeated."
 )
 flags.DEFINE_enum("engine", "local", ["local", "ray"], "Processes here, or a Ray cluster.")
 flags.DEFINE_integer("jobs", 0, "local: most trials at a time; 0: as many as fit.", 0)
@@ -98,7 +102,7 @@ def write_outputs(settings: list[Setting]) -> None:
 
 def sweep(config, folder: pathlib.Path, given: list[str]) -> int:
     """The whole sweep; returns how many trials failed."""
-    settings = make_settings(config, parse_axes(FLAGS.axis, config), folder)
+    settings = make_settings(config, parse_axes(FLAGS.axis, config, FLAGS.change), folder)
     record = claim_folders(settings, folder)
     trials = [t for s in settings for t in make_trials(s, given, compilation.as_flags())]
     planned = sum(part.policy is not None for s in settings for part in s.parts)

@@ -148,6 +148,34 @@ def test_options_may_change_together():
         parse_axes([texts[0], "config.batch_size=2"], quickstart.get_config())
 
 
+def test_options_may_change_one_at_a_time(tmp_path):
+    config = quickstart.get_config()
+    changes = ["config.uncertainty.log2_cells=5,7", "config.num_rounds+config.batch_size=1+8"]
+    axes = parse_axes(["config.image_size=50,100"], config, changes)
+    ablated = ({}, {"uncertainty.log2_cells": 5}, {"uncertainty.log2_cells": 7})
+    ablated = (*ablated, {"num_rounds": 1, "batch_size": 8})
+    assert settings(axes) == [{"image_size": size} | one for size in (50, 100) for one in ablated]
+    made = make_settings(config, parse_axes([], config, changes[:1]), tmp_path)
+    names = ["unchanged", "uncertainty.log2_cells=5", "uncertainty.log2_cells=7"]
+    assert [setting.name for setting in made] == names
+    assert made[0].config == config and made[1].config.uncertainty.log2_cells == 5
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("seed=0:3", "seed is an axis"),
+        ("policy=random", "policy is an axis"),
+        ("config.nothing=1", "no axis config.nothing"),
+        ("config.image_size=50", "given twice"),
+    ],
+)
+def test_a_wrong_change_is_one_line_that_names_it(text, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        parse_axes(["config.image_size=50,100"], quickstart.get_config(), [text])
+    assert str(error.value).startswith(f"--change={text}: ") and "\n" not in str(error.value)
+
+
 @pytest.mark.parametrize(
     "text, message",
     [

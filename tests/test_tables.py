@@ -194,6 +194,21 @@ def test_settings_are_compared_seed_by_seed(tmp_path):
     assert rows["7", "bavs"][-1].why == "L=7, bavs: no completed run"
 
 
+def test_settings_that_set_different_options_go_by_their_names(tmp_path):
+    changes = {"unchanged": {}, "L=5": {"L": 5}, "weighting=eq11": {"weighting": "eq11"}}
+    rows = [
+        {"folder": name, "values": values, "policies": ["bavs"], "seeds": [0, 1]}
+        for name, values in changes.items()
+    ]
+    write_record(tmp_path, Record("the command", rows, {}))
+    for name in changes:
+        write_workdir(tmp_path / name, [make_result("bavs", s) for s in (0, 1)], arrays=False)
+    table = collect_tables(tmp_path).tables["settings"]
+    assert table.head[:2] == ("setting", "policy")
+    assert table.head[-1] == "PSNR gap to unchanged (dB)"
+    assert [row[0].text for row in table.rows] == [*changes]
+
+
 def test_what_is_missing_of_a_sweep_says_why(tmp_path):
     text = result_tables(make_sweep(tmp_path))
     assert "the command" in text

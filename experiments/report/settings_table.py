@@ -23,20 +23,21 @@ class Setting:
 
 
 def settings_table(settings: list[Setting]) -> Table:
-    """Means over seeds at the end of each setting, with gaps paired by seed."""
-    options = list(dict.fromkeys(option for s in settings for option in s.values))
+    """Means over seeds at the end of each setting, with gaps paired by seed.
+
+    Options that every setting sets have a column each; where settings differ in what they set, as
+    with one change at a time, their names are the first column.
+    """
+    options = [*settings[0].values] if len({(*s.values,) for s in settings}) == 1 else []
     measures = [m for m in stats.MEASURES if any(_has(s.runs, m.key) for s in settings)]
     compared = any(REFERENCE in s.policies and len(s.policies) > 1 for s in settings)
-    head = [*options, "policy", "seeds", "views"]
+    head = [*(options or ["setting"]), "policy", "seeds", "views"]
     head += [f"{m.label} ({m.unit})" if m.unit else m.label for m in measures]
     head += [f"PSNR gap to {REFERENCE} (dB)"] * compared
     head += [f"PSNR gap to {settings[0].name} (dB)"]
     rows = []
     for setting in settings:
-        fixed = [
-            Cell(str(setting.values[o])) if o in setting.values else dash(f"{o}: not set")
-            for o in options
-        ]
+        fixed = [Cell(str(setting.values[o])) for o in options] or [Cell(setting.name)]
         for policy in setting.policies:
             cells = _row(setting, policy, measures, settings[0], compared)
             rows.append((*fixed, Cell(policy), *cells))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import itertools
 import re
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from experiments.errors import ConfigError
@@ -18,9 +19,10 @@ class Axes(NamedTuple):
     policies: tuple[str, ...]
     seeds: tuple[int, ...]
     options: tuple[tuple[dict[str, Any], ...], ...]  # of each axis, what each of its values sets
+    changes: tuple[dict[str, Any], ...] = ()  # made one at a time, beside no change
 
 
-def parse_axes(texts: list[str], config) -> Axes:
+def parse_axes(texts: list[str], config, changes: Sequence[str] = ()) -> Axes:
     """Reads `name=value,value` of each axis; policies and seeds not named are the config's.
 
     Args:
@@ -28,36 +30,47 @@ def parse_axes(texts: list[str], config) -> Axes:
         `first:end:step` without the end. Commas inside brackets belong to a value. Options that
         change together are one axis: `config.num_rounds+config.batch_size=4+4,1+16`.
       config: tells which options there are, and of what type.
+      changes: options in the same form, of which each value is tried alone, not in every
+        combination with the others.
 
     Raises:
       ConfigError: an axis that is unknown, given twice or empty, or a value of another type.
     """
     found: dict[str, tuple] = {}
     options = []
+    alone = []
     seen: list[str] = []
-    for text in texts:
+    for flag, text in [("axis", t) for t in texts] + [("change", t) for t in changes]:
         name, equals, values = text.partition("=")
-        if not equals or not values:
-            raise ConfigError(f"--axis={text}: give name=value,value, such as seed=0:5")
-        names = name.split("+")
-        if len({*seen, *names}) < len(seen) + len(names):
-            raise ConfigError(f"--axis={text}: {name} is given twice")
-        seen += names
-        examples = [_example(n, text, config, alone=len(names) == 1) for n in names]
-        if name in OWN_AXES.values():
-            found[name] = _values(name, values, examples[0])
-        else:
-            options.append(_option_values(names, values, examples))
+        try:
+            if not equals or not values:
+                raise ConfigError("give name=value,value, such as seed=0:5")
+            names = name.split("+")
+            if len({*seen, *names}) < len(seen) + len(names):
+                raise ConfigError(f"{name} is given twice")
+            seen += names
+            examples = [_example(n, config, alone=len(names) == 1) for n in names]
+            if name not in OWN_AXES.values():
+                (options if flag == "axis" else alone).append(
+                    _option_values(names, values, examples)
+                )
+            elif flag == "axis":
+                found[name] = _values(values, examples[0])
+            else:
+                raise ConfigError(f"{name} is an axis: --axis={text}")
+        except ConfigError as error:
+            raise ConfigError(f"--{flag}={text}: {error}") from None
     return Axes(
         policies=found.get("policy", tuple(config.policies)),
         seeds=found.get("seed", tuple(config.seeds)),
         options=tuple(options),
+        changes=tuple(itertools.chain(*alone)),
     )
 
 
 def settings(axes: Axes) -> list[dict[str, Any]]:
-    """Every combination of the options' values; one that is empty where there are no options."""
-    rows = itertools.product(*axes.options)
+    """Every combination of the axes' values, as it is and then with one change at a time."""
+    rows = itertools.product(*axes.options, ({}, *axes.changes))
     return [{name: v for part in row for name, v in part.items()} for row in rows]
 
 
@@ -67,23 +80,23 @@ def setting_name(values: dict[str, Any]) -> str:
     return re.sub(r"[^\w.,=+-]+", "_", name) or "."
 
 
-def _example(name: str, text: str, config, *, alone: bool):
+def _example(name: str, config, *, alone: bool):
     """A value of the axis, for its type."""
     if name in OWN_AXES.values() and alone:
         return "" if name == "policy" else 0
     option = name.removeprefix("config.")
     if option in OWN_AXES:
-        raise ConfigError(f"--axis={text}: sweep over {OWN_AXES[option]}=... instead")
+        raise ConfigError(f"sweep over {OWN_AXES[option]}=... instead")
     known = config.to_dict()
     for key in option.split("."):
         if option == name or not isinstance(known, dict) or key not in known:
             raise ConfigError(
-                f"--axis={text}: no axis {name}; use policy, seed or config.NAME with an option "
+                f"no axis {name}; use policy, seed or config.NAME with an option "
                 "of experiments/configs/base.py"
             )
         known = known[key]
     if isinstance(known, dict):
-        raise ConfigError(f"--axis={text}: {option} is a group of options; name one of {(*known,)}")
+        raise ConfigError(f"{option} is a group of options; name one of {(*known,)}")
     return known
 
 
@@ -91,25 +104,21 @@ def _option_values(names: list[str], text: str, examples: list) -> tuple[dict[st
     """What each value of an axis sets: one option, or several at once."""
     options = [name.removeprefix("config.") for name in names]
     if len(names) == 1:
-        return tuple({options[0]: value} for value in _values(names[0], text, examples[0]))
+        return tuple({options[0]: value} for value in _values(text, examples[0]))
     rows = [item.split("+") for item in _items(text)]
     for row in rows:
         if len(row) != len(names):
-            raise ConfigError(
-                f"--axis={'+'.join(names)}: {'+'.join(row)!r} is not {len(names)} values"
-            )
-    return tuple(
-        {o: _value(n, v, e) for o, n, v, e in zip(options, names, row, examples)} for row in rows
-    )
+            raise ConfigError(f"{'+'.join(row)!r} is not {len(names)} values")
+    return tuple({o: _value(v, e) for o, v, e in zip(options, row, examples)} for row in rows)
 
 
-def _values(name: str, text: str, example) -> tuple:
+def _values(text: str, example) -> tuple:
     values = []
     for item in _items(text):
         is_range = type(example) is int and re.fullmatch(r"-?\d+(:-?\d+){1,2}", item)
-        values += range(*map(int, item.split(":"))) if is_range else [_value(name, item, example)]
+        values += range(*map(int, item.split(":"))) if is_range else [_value(item, example)]
     if not values or len(set(values)) < len(values):
-        raise ConfigError(f"--axis={name}={text}: has no value, or one of them twice")
+        raise ConfigError("has no value, or one of them twice")
     return tuple(values)
 
 
@@ -118,7 +127,7 @@ def _items(text: str) -> list[str]:
     return re.split(r",(?![^(\[]*[)\]])", text)
 
 
-def _value(name: str, text: str, example):
+def _value(text: str, example):
     if isinstance(example, str):
         return text
     try:
@@ -128,7 +137,5 @@ def _value(name: str, text: str, example):
     if isinstance(example, float) and type(value) is int:
         value = float(value)
     if type(value) is not type(example):
-        raise ConfigError(
-            f"--axis={name}: {text!r} is not of type {type(example).__name__}, as {example!r} is"
-        )
+        raise ConfigError(f"{text!r} is not of type {type(example).__name__}, as {example!r} is")
     return value

@@ -12,6 +12,7 @@ from experiments.parts import Part, all_parts, is_finished
 from experiments.sweeps.axes import Axes, setting_name, settings
 from experiments.sweeps.schedule import Job
 
+UNCHANGED = "unchanged"  # folder of the config as it is, beside those of changes
 SCRIPT = ("-m", "experiments.active_selection")
 
 
@@ -45,7 +46,7 @@ def make_settings(config, axes: Axes, workdir: pathlib.Path) -> list[Setting]:
         own = copy.deepcopy(config)
         own.policies, own.seeds = axes.policies, axes.seeds
         own.update_from_flattened_dict(values)
-        name = setting_name(values)
+        name = setting_name(values) if values or not axes.changes else UNCHANGED
         parts = all_parts(axes.policies, axes.seeds)
         if name in [setting.name for setting in made]:
             raise ConfigError(f"--axis: two settings would share the folder {name}; drop one")
