@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +12,9 @@ import numpy as np
 import pytest
 
 from bavs_jax.selection.policies import POLICIES
+from experiments.errors import ConfigError, WorkdirError
+from experiments.remeasure import Wanted, remeasure
+from experiments.report.collected import collect_tables
 from tests.toy_runs import toy_flags
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -32,6 +36,16 @@ def finished(tmp_path_factory):
     done = script(f"--workdir={folder}", *flags)
     assert done.returncode == 0, done.stderr
     return folder, done.stdout
+
+
+@pytest.fixture
+def unmeasured(finished, tmp_path, monkeypatch):
+    """A copy of it, and a stand-in for LPIPS, whose package need not be there."""
+    monkeypatch.setattr(
+        "experiments.build.make_lpips_fn", lambda net: (lambda a, b: abs(a - b).mean(), None)
+    )
+    monkeypatch.setattr("experiments.runtime.cache_folder", lambda: tmp_path / "cache")
+    return shutil.copytree(finished[0], tmp_path / "copy")
 
 
 def load(folder, policy="bavs"):
@@ -153,3 +167,43 @@ def test_another_config_in_the_same_folder_is_refused(finished):
     )
     assert done.returncode != 0 and "train.num_steps" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+# --- LPIPS afterwards ---
+
+
+@pytest.mark.usefixtures("quick_compilation")
+def test_lpips_is_added_to_finished_runs(unmeasured, capsys):
+    before = {policy: load(unmeasured, policy) for policy in ("bavs", "random")}
+    remeasure(unmeasured, Wanted(policies=["random"]), "later")
+    assert load(unmeasured) == before["bavs"]
+    after = load(unmeasured, "random")
+    *earlier, last = after["rounds"]
+    assert earlier == before["random"]["rounds"][:-1]
+    assert 0 < last["lpips"] < 1 and last | {"lpips": None} == before["random"]["rounds"][-1]
+    assert (after["lpips_reason"], after["remeasured_by"]) == (None, "later")
+    summary = json.loads((unmeasured / "summary.json").read_text())
+    assert summary["runs"] == [before["bavs"], after]
+    assert collect_tables(unmeasured).made.count("`, then `later`") == 1
+    remeasure(unmeasured, Wanted(policies=["random"]), "once more")
+    assert load(unmeasured, "random") == after
+    assert "nothing is left to measure" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("quick_compilation")
+def test_remeasuring_notices_another_scene_and_a_missing_run(unmeasured):
+    path = unmeasured / "random" / "seed_0" / "result.json"
+    result = load(unmeasured, "random")
+    result["rounds"][-1]["psnr"] += 0.5
+    path.write_text(json.dumps(result))
+    with pytest.raises(WorkdirError, match=r"psnr: the run had .* dB, its checkpoint has"):
+        remeasure(unmeasured, Wanted(policies=["random"]), "later")
+    assert load(unmeasured, "random") == result
+    with pytest.raises(ConfigError, match=r"--policy: warp: .* holds no finished run of it"):
+        remeasure(unmeasured, Wanted(policies=["warp"]), "later")
+
+
+def test_remeasuring_without_the_package_says_what_to_install(unmeasured, monkeypatch):
+    monkeypatch.setattr("experiments.build.make_lpips_fn", lambda net: (None, "install it"))
+    with pytest.raises(ConfigError, match="--lpips_net: install it"):
+        remeasure(unmeasured, Wanted(), "later")

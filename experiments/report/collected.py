@@ -138,6 +138,8 @@ def _setting_row(record: Record, folder: str) -> dict:
 def _made_words(record: Record | None, runs: list[Run]) -> str:
     commands = list(dict.fromkeys(run.result["command"] for run in runs))
     command = common_command(commands) if record is None else record.command
+    later = dict.fromkeys(run.result.get("remeasured_by") for run in runs)
+    command = "`, then `".join([command, *filter(None, later)])
     devices = ", ".join(dict.fromkeys(run.result["device"] for run in runs))
     return f"`{command}` ({devices}; means over seeds ± half of the 95 % interval)"
 
