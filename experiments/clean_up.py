@@ -26,7 +26,7 @@ from experiments.posthoc import script
 from experiments.posthoc.cleanup_figures import sweep_figure, views_figure
 from experiments.posthoc.cleanup_results import in_words, summary
 from experiments.posthoc.cleanup_sweep import make_cleaned_chunk_fn, sweep_views
-from experiments.posthoc.figures import save_png
+from experiments.report.panels import save_figure
 from experiments.trained import TrainedRun, run_curvature, run_variance
 
 NUM_PICTURES = 4
@@ -79,10 +79,10 @@ def clean_run(run: TrainedRun) -> dict:
     choice = {name: FLAGS[name].value for name in ("rule", "max_loss", "keep")}
     row = choose_threshold(sweeps["training"], **choice)
     folder = run.folder / "cleanup"
-    save_png(sweep_figure(sweeps["training"], sweeps["test"], row), folder / "sweep.png")
+    save_figure(sweep_figure(sweeps["training"], sweeps["test"], row), folder / "sweep.png")
     pictures = spread_evenly(test_views, NUM_PICTURES)
     views = before_and_after(cleaned, run, pictures, thresholds[row])
-    save_png(views_figure(views), folder / "views.png")
+    save_figure(views_figure(views), folder / "views.png")
     print(f"pictures: {folder / 'sweep.png'}, {folder / 'views.png'}")
     options = {**choice, "min_opacity": FLAGS.min_opacity, "num_test": len(test_views)}
     return {

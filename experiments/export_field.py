@@ -32,9 +32,9 @@ from bavs_jax.scenes.poses import user_units
 from experiments.build_scene import true_surface
 from experiments.files import write_json
 from experiments.posthoc import field_files, script
-from experiments.posthoc.figures import save_png
 from experiments.posthoc.points import scene_point_fn
 from experiments.posthoc.slices import slices_figure
+from experiments.report.panels import save_figure
 from experiments.trained import TrainedRun, run_curvature, run_variance
 
 WHAT = ("grid", "points", "mesh")
@@ -89,7 +89,7 @@ def export_run(run: TrainedRun) -> dict[str, pathlib.Path]:
     if "grid" in FLAGS.what:
         files |= field_files.write_grid(folder, scene, axes, grid)
         files["slices"] = folder / "slices.png"
-        save_png(slices_figure(axes, grid), files["slices"])
+        save_figure(slices_figure(axes, grid), files["slices"])
     if "points" in FLAGS.what:
         files |= field_files.write_points(
             folder,

@@ -27,8 +27,8 @@ from experiments.posthoc.draws import (
     largest_offset,
     spread_measures,
 )
-from experiments.posthoc.figures import Panel, panel_table, save_png
 from experiments.posthoc.tables import SPLITS
+from experiments.report.panels import Panel, panel_table, save_figure
 from experiments.trained import TrainedRun
 
 NUM_SHOWN = 3  # draws in the picture
@@ -86,7 +86,7 @@ def draw_run(run: TrainedRun) -> dict:
     split["farthest"] = [view for view in split["test"] if view.view_id == far]
     shown = [split["training"][0], *split["farthest"]]
     path = run.folder / "draws" / "draws.png"
-    save_png(draws_figure(run, shown), path)
+    save_figure(draws_figure(run, shown), path)
     print(f"picture:  {path}")
     return {
         **script.about_run(run),

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from bavs_jax.metrics.covered import Sweep
-from experiments.posthoc.figures import Panel, panel_table
+from experiments.report.panels import Panel, panel_table
 from experiments.report.plots import BLUE, GREEN, GREY, ORANGE, VERMILION, tidy
 
 

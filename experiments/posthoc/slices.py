@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.posthoc.field_files import on_unit_scale
-from experiments.posthoc.figures import TEXT, bare, colour_bar
+from experiments.report.panels import TEXT, bare, colour_bar
 
 ROWS = {  # title, colour map
     "opacity": ("light that a voxel stops", "Greys"),

@@ -98,7 +98,9 @@ def strips(
         images = (
             Picture(png_uri(shrink(truth, max_side)), f"true image of {name}", "truth"),
             Picture(
-                png_uri(shrink(rgb, max_side)), f"render of {name}", f"render, {_psnr(rgb, truth)}"
+                png_uri(shrink(rgb, max_side)),
+                f"render of {name}",
+                f"render, {psnr_words(rgb, truth)}",
             ),
             Picture(png_uri(error), f"error of {name}", f"error {_mean(pictures['error'][i])}"),
             Picture(
@@ -130,7 +132,8 @@ def colour_bars(limits: tuple[float, float]) -> list[ColourBar]:
     ]
 
 
-def _psnr(rgb: np.ndarray, truth: np.ndarray) -> str:
+def psnr_words(rgb: np.ndarray, truth: np.ndarray) -> str:
+    """PSNR of an image in [0, 255] against another."""
     mse = np.mean((rgb.astype(np.float64) - truth.astype(np.float64)) ** 2) / 255.0**2
     return "identical" if mse == 0.0 else f"{-10.0 * np.log10(mse):.2f} dB"
 

@@ -77,6 +77,15 @@ def policy_style(policies: list[str]) -> dict[str, tuple[str, str]]:
 def quality_plot(
     runs: list[Run], policies: list[str], measure: stats.Measure, coloured: list[str]
 ) -> str | None:
+    """`quality_figure` as an element of a page."""
+    figure = quality_figure(runs, policies, measure, coloured)
+    label = f"{measure.label} against training views"
+    return None if figure is None else to_svg(figure, salt=f"quality-{measure.key}", label=label)
+
+
+def quality_figure(
+    runs: list[Run], policies: list[str], measure: stats.Measure, coloured: list[str]
+) -> Figure | None:
     """One measure against the number of training views, or None if no run has it.
 
     Policies that are not in `coloured` are thin grey means without names.
@@ -136,9 +145,7 @@ def quality_plot(
     axes.set_ylim(*_padded([v for run in runs for _, v in _points(run, measure.key)]))
     tidy(axes)
     _label_ends(axes, ends, {**style, **{f"{p} (incomplete)": s for p, s in style.items()}})
-    return to_svg(
-        figure, salt=f"quality-{measure.key}", label=f"{measure.label} against training views"
-    )
+    return figure
 
 
 def _padded(values: list[float]) -> tuple[float, float]:

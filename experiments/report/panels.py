@@ -1,14 +1,14 @@
-"""Figures as PNG files: panels of images, and what all of them share."""
+"""Figures as files: panels of images, and what all of them share."""
 
 from __future__ import annotations
 
 import os
+import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -29,11 +29,10 @@ class Panel(NamedTuple):
     limits: tuple[float, float] = (0.0, 1.0)  # of the colour map
 
 
-def save_png(figure: Figure, path: str | os.PathLike) -> None:
-    """Writes a figure whole or not at all."""
-    canvas = FigureCanvasAgg(figure)
-    figure.set_dpi(DPI)
-    write_atomic(path, lambda file: canvas.print_png(file))
+def save_figure(figure: Figure, path: str | os.PathLike) -> None:
+    """Writes a figure whole or not at all; the end of its name, such as `.pdf`, is the format."""
+    form = pathlib.Path(path).suffix.removeprefix(".")
+    write_atomic(path, lambda file: figure.savefig(file, format=form, dpi=DPI))
 
 
 def panel_table(rows: Sequence[tuple[str, Sequence[Panel]]], *, scale_label: str = "") -> Figure:
@@ -44,7 +43,9 @@ def panel_table(rows: Sequence[tuple[str, Sequence[Panel]]], *, scale_label: str
       scale_label: what the last colour map of each row shows; adds its scale at the right.
     """
     num = len(rows[0][1])
-    figure = Figure(figsize=(PANEL * num + 0.8, PANEL * len(rows) + 0.3), layout="constrained")
+    height, width = rows[0][1][0].image.shape[:2]
+    row_height = PANEL * height / width + 0.15 * (height < width)  # room for the titles
+    figure = Figure(figsize=(PANEL * num + 0.8, row_height * len(rows) + 0.3), layout="constrained")
     grid = figure.subplots(len(rows), num, squeeze=False)
     for axes, (name, panels) in zip(grid, rows):
         for place, panel in zip(axes, panels):
