@@ -66,6 +66,10 @@ def build_trainer(
         learning_rate=learning_rate(config),
         final_share=train.final_share,
         num_steps=train.num_steps,
+        warmup=train.warmup_steps,
+        max_grad_norm=train.max_grad_norm,
+        second_decay=train.adam_b2,
+        epsilon=train.adam_eps,
     )
     call = make_train_fn(
         field,

@@ -56,6 +56,35 @@ def trainer():
     return scene, field, sampler, train, fresh
 
 
+def test_learning_rate_rises_and_decays():
+    options = {"learning_rate": 2e-3, "final_share": 0.01, "num_steps": 1000, "warmup": 100}
+    _, schedule = make_optimiser(**options)
+    rates = [float(schedule(step)) for step in (0, 50, 100, 550, 1000, 2000)]
+    np.testing.assert_allclose(rates, [2e-4, 1.1e-3, 2e-3, 2e-4, 2e-5, 2e-5], rtol=1e-5)
+
+
+def test_optimiser_is_adam_on_gradients_that_are_cut_to_a_norm():
+    second_decay, epsilon, longest = 0.8, 0.3, 2.0
+    optimiser, schedule = make_optimiser(
+        learning_rate=0.5,
+        final_share=0.1,
+        num_steps=8,
+        max_grad_norm=longest,
+        second_decay=second_decay,
+        epsilon=epsilon,
+    )
+    params = {"a": jnp.zeros(2), "b": jnp.zeros(1)}
+    state, m, v = optimiser.init(params), np.zeros(3), np.zeros(3)
+    for step, grad in enumerate(([3.0, -4.0, 12.0], [0.5, 1.0, -1.0])):
+        grad = np.array(grad)
+        updates, state = optimiser.update({"a": grad[:2], "b": grad[2:]}, state, params)
+        grad = grad * min(1.0, longest / np.linalg.norm(grad))  # of norm 13, then 1.5
+        m, v = 0.9 * m + 0.1 * grad, second_decay * v + (1 - second_decay) * grad**2
+        m_hat, v_hat = m / (1 - 0.9 ** (step + 1)), v / (1 - second_decay ** (step + 1))
+        expected = -float(schedule(step)) * m_hat / (np.sqrt(v_hat) + epsilon)
+        np.testing.assert_allclose([*updates["a"], *updates["b"]], expected, rtol=1e-5)
+
+
 def test_sampled_pixels_come_from_training_views_alone_and_from_all_of_them(trainer):
     scene = trainer[0]
     table = make_pixel_table(scene)

@@ -40,8 +40,33 @@ class TrainInfo:
     learning_rate: jax.Array  # []
 
 
-def make_optimiser(*, learning_rate: float, final_share: float, num_steps: int, warmup: int = 32):
-    """Adam with a short warm-up and an exponential decay to `final_share * learning_rate`."""
+def make_optimiser(
+    *,
+    learning_rate: float,
+    final_share: float,
+    num_steps: int,
+    warmup: int = 32,
+    max_grad_norm: float = 0.0,
+    second_decay: float = 0.99,
+    epsilon: float = 1e-15,
+):
+    """Adam with a warm-up and an exponential decay to `final_share * learning_rate`.
+
+    The defaults of `second_decay` (Adam's beta_2) and `epsilon` are those of hash grids, whose
+    entries see few and small gradients (Mueller et al. 2022, section 4).
+
+    Args:
+      learning_rate: at the end of the warm-up; a tenth of it at the beginning.
+      final_share: of the learning rate, after `num_steps`.
+      num_steps: optimiser steps.
+      warmup: how many of them the learning rate rises for.
+      max_grad_norm: gradients of a larger Euclidean norm, over all parameters, are scaled down to
+        it; 0 for none.
+      second_decay, epsilon: of Adam.
+
+    Returns:
+      The optimiser, and its learning rate as a function of the step.
+    """
     schedule = optax.warmup_exponential_decay_schedule(
         init_value=0.1 * learning_rate,
         peak_value=learning_rate,
@@ -50,7 +75,10 @@ def make_optimiser(*, learning_rate: float, final_share: float, num_steps: int, 
         decay_rate=final_share,
         end_value=final_share * learning_rate,
     )
-    return optax.adam(schedule, b1=0.9, b2=0.99, eps=1e-15), schedule
+    adam = optax.adam(schedule, b1=0.9, b2=second_decay, eps=epsilon)
+    if max_grad_norm > 0.0:
+        adam = optax.chain(optax.clip_by_global_norm(max_grad_norm), adam)
+    return adam, schedule
 
 
 def init_train_state(key, field: Field, sampler: Sampler, optimiser) -> TrainState:

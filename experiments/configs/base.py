@@ -112,6 +112,10 @@ def get_config() -> ConfigDict:
     config.train.capacity = 8192  # samples evaluated in one step
     config.train.learning_rate = 0.0  # 0: what suits the field kind
     config.train.final_share = 0.1  # of the learning rate, at the end of a round
+    config.train.warmup_steps = 32  # until the learning rate has its full height
+    config.train.max_grad_norm = 0.0  # longer gradients are cut to this; 0: never
+    config.train.adam_b2 = 0.99
+    config.train.adam_eps = 1e-15
     config.train.penalty_weight = 0.1  # of the field's own penalty: hash tables stay small
     config.train.steps_per_call = 16  # compiled together
 

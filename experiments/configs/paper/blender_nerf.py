@@ -13,6 +13,8 @@ def get_config():
     config.nerf_mlp.position_degree = 10
     config.coarse_to_fine.num_coarse = 64
     config.coarse_to_fine.num_fine = 128
+    config.train.num_rays = 4096
+    config.train.capacity = 262_144
     config.train.learning_rate = 5e-4
     config.train.num_steps = 50_000
     config.uncertainty.log2_cells = 8

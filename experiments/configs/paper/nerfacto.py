@@ -18,6 +18,7 @@ def get_config():
     config.proposal.log2_table_size = 17
     config.train.num_steps = 30_000
     config.train.num_rays = 4096
+    config.train.capacity = 262_144
     config.uncertainty.log2_cells = 8
     config.uncertainty.max_rays = 0
     return config
