@@ -225,6 +225,7 @@ def test_a_sweep_over_seeds_alone_reads_like_an_experiment(tmp_path):
     assert found.made.startswith("`swept`")
     assert [row[0].text for row in found.tables["quality"].rows] == ["random", "bavs"]
     assert found.notes == tuple(f"Missing: bavs, seed {s}: not run yet." for s in (0, 1))
+    assert collect_tables(tmp_path, only=["random"]).notes == ()
 
 
 # --- pages ---

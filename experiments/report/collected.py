@@ -79,7 +79,7 @@ def run_tables(
     if record is not None:
         planned = _setting_row(record, ".")["policies"]
         policies = list(dict.fromkeys([*policies, *(p for p in planned if not only or p in only)]))
-        notes = _missing_notes(record, {".": runs})
+        notes = _missing_notes(record, {".": runs}, only)
     if not runs:
         raise ReportError(f"{folder / 'summary.json'}: holds no run; wait for the first to end")
     made = {name: make(runs, policies) for name, make in RUN_TABLES.items()}
@@ -150,12 +150,17 @@ def common_command(commands: list[str]) -> str:
     return " ".join(word for word in words[0] if all(word in others for others in words))
 
 
-def _missing_notes(record: Record, runs: dict[str, list[Run]]) -> tuple[str, ...]:
-    """Every run that was planned and has no result."""
+def _missing_notes(
+    record: Record, runs: dict[str, list[Run]], only: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """Every run that was planned, of a policy that is shown, and has no result."""
     notes = []
     for folder, some in runs.items():
         done = {(run.policy, run.seed) for run in some if run.completed}
         where = "" if folder == "." else f"{folder}, "
-        missing = record.missing(folder, done)
-        notes += [f"Missing: {where}{p}, seed {s}: {why}." for (p, s), why in missing.items()]
+        notes += [
+            f"Missing: {where}{policy}, seed {seed}: {why}."
+            for (policy, seed), why in record.missing(folder, done).items()
+            if policy in (only or (policy,))
+        ]
     return tuple(notes)
