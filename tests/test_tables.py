@@ -1,6 +1,7 @@
 """Tables of result files in every format; the README's are those that the committed files make."""
 
 import csv
+import dataclasses
 import io
 import itertools
 import json
@@ -12,9 +13,11 @@ from scipy import stats as scipy_stats
 
 from experiments.posthoc.tables import cleanup_table, draws_table, geometry_table
 from experiments.report import ReportError, stats
-from experiments.report.collected import collect_tables
+from experiments.report.collected import collect_tables, run_tables
 from experiments.report.formats import comma_separated, latex, markdown
+from experiments.report.over_scenes import mean_runs
 from experiments.report.printed import TABLES
+from experiments.report.results import load_runs
 from experiments.report.tables import Cell, Table, interval_cell
 from experiments.sweeps.record import Record, write_record
 from experiments.tables import MARKED, fill_page, result_tables
@@ -207,6 +210,57 @@ def test_settings_that_set_different_options_go_by_their_names(tmp_path):
     assert table.head[:2] == ("setting", "policy")
     assert table.head[-1] == "PSNR gap to unchanged (dB)"
     assert [row[0].text for row in table.rows] == [*changes]
+
+
+def make_scenes(folder, names=("lego", "ship")):
+    """A sweep over scenes: each is 2 dB above the one before, and one run is missing."""
+    rows = []
+    for number, name in enumerate(names):
+        rows.append({"folder": f"scene={name}", "values": {"scene": name}})
+        rows[-1] |= {"policies": ["random", "bavs"], "seeds": [0, 1, 2]}
+        results = [make_result(p, s) for p in ("random", "bavs") for s in (0, 1, 2)]
+        for result in results:
+            result["scene"]["name"] = name
+            result["rounds"][-1]["psnr"] += 2.0 * number
+            result["rounds"][-1]["num_survivors"] = 10 * number
+            result["rounds"][-1]["seconds"]["score"] = 3.0 * number
+        write_workdir(folder / f"scene={name}", results[: 6 - number], arrays=False)
+    write_record(folder, Record("over scenes", rows, {}))
+    return folder
+
+
+def test_a_sweep_over_scenes_has_their_mean_and_the_papers_rows(tmp_path):
+    found = collect_tables(make_scenes(tmp_path), "table_1")
+    assert found.tables["settings"].head[-1] == "PSNR gap to random (dB)"
+    assert found.notes[0] == "Tables after the first are of means over these 2 scenes."
+    rows = {row[0].text: row for row in found.tables["quality"].rows}
+    one = {row[0].text: row for row in run_tables(tmp_path / "scene=lego").tables["quality"].rows}
+    assert (rows["random"][1].text, rows["bavs"][1].text) == ("3", "2")  # seeds that all have
+    level, alone = (float(r["random"][3].text.split()[0]) for r in (rows, one))
+    assert level == pytest.approx(alone + 1.0, abs=0.011)
+    row = next(row for row in found.tables["paper"].rows if row[0].text == "random")
+    assert row[2].text == rows["random"][3].text and row[3].text == "27.14"
+
+
+def test_means_over_scenes_are_taken_measure_by_measure(tmp_path):
+    folder = make_scenes(tmp_path)
+    scenes = [load_runs(folder / f"scene={name}") for name in ("lego", "ship")]
+    mean = next(run for run in mean_runs(scenes) if run.label == "random, seed 0")
+    first, second = (next(r for r in runs if r.label == mean.label) for runs in scenes)
+    for ours, a, b in zip(mean.rounds, first.rounds, second.rounds, strict=True):
+        assert ours["psnr"] == pytest.approx((a["psnr"] + b["psnr"]) / 2)
+        assert ours["num_views"] == a["num_views"] and ours["lpips"] is None
+    assert mean.rounds[-1]["num_survivors"] == 5
+    assert mean.rounds[-1]["seconds"]["score"] == 1.5
+    with pytest.raises(ReportError, match="lego, ship were measured at different numbers of views"):
+        mean_runs([scenes[0], [dataclasses.replace(second, rounds=second.rounds[1:])]])
+
+
+def test_a_sweep_over_options_has_no_row_of_the_paper(tmp_path):
+    with pytest.raises(ReportError, match="table_1 is over scenes; give the folder of one"):
+        collect_tables(make_sweep(tmp_path), "table_1")
+    table = collect_tables(tmp_path, only=["bavs"]).tables["settings"]
+    assert {row[1].text for row in table.rows} == {"bavs"}
 
 
 def test_what_is_missing_of_a_sweep_says_why(tmp_path):

@@ -7,6 +7,7 @@ import pathlib
 from collections.abc import Sequence
 
 from experiments.report.formats import FORMATS, latex_text
+from experiments.report.over_scenes import mean_runs
 from experiments.report.paper_table import paper_table
 from experiments.report.results import ReportError, Run, load_runs
 from experiments.report.settings_table import Setting, settings_table
@@ -82,30 +83,39 @@ def run_tables(
         notes = _missing_notes(record, {".": runs}, only)
     if not runs:
         raise ReportError(f"{folder / 'summary.json'}: holds no run; wait for the first to end")
-    made = {name: make(runs, policies) for name, make in RUN_TABLES.items()}
-    if paper is not None:
-        made["paper"] = paper_table(runs, policies, paper)
-    tables = {name: table for name, table in made.items() if table is not None}
+    tables = _made_tables(runs, policies, paper)
     return Collected(_made_words(record, runs), tables, notes)
 
 
-def sweep_tables(folder: pathlib.Path) -> Collected:
-    """The settings of a sweep against each other.
+def sweep_tables(
+    folder: pathlib.Path, paper: str | None = None, only: Sequence[str] = ()
+) -> Collected:
+    """The settings of a sweep against each other; of a sweep over scenes also their mean.
+
+    Args:
+      folder: of the sweep.
+      paper, only: see `run_tables`; the paper's rows stand beside means over scenes.
 
     Raises:
-      ReportError: a file that cannot be used, or no result so far.
+      ReportError: a file that cannot be used, no result so far, or no scenes for `paper`.
     """
     record = read_record(folder)
-    runs = {row["folder"]: _runs_so_far(folder / row["folder"]) for row in record.settings}
-    settings = [
-        Setting(row["folder"], row["values"], row["policies"], runs[row["folder"]])
-        for row in record.settings
-    ]
+    settings = [_setting(folder, row, only) for row in record.settings]
+    runs = {setting.name: setting.runs for setting in settings}
     done = [run for some in runs.values() for run in some]
     if not done:
         raise ReportError(f"{folder / SWEEP_FILE}: no trial has a result so far")
-    notes = _missing_notes(record, runs)
-    return Collected(_made_words(record, done), {"settings": settings_table(settings)}, notes)
+    over_scenes = all(setting.values.keys() == {"scene"} for setting in settings)
+    tables = {"settings": settings_table(settings, compared=not over_scenes)}
+    notes = _missing_notes(record, runs, only)
+    if over_scenes:
+        policies = list(dict.fromkeys(p for setting in settings for p in setting.policies))
+        means = mean_runs([*runs.values()])
+        tables |= _made_tables(means, policies, paper) if means else {}
+        notes = (f"Tables after the first are of means over these {len(settings)} scenes.", *notes)
+    elif paper is not None:
+        raise ReportError(f"{folder}: {paper} is over scenes; give the folder of one setting")
+    return Collected(_made_words(record, done), tables, notes)
 
 
 def collect_tables(
@@ -114,8 +124,24 @@ def collect_tables(
     """The tables of whatever a folder holds: of a sweep over options, or of one experiment."""
     record = read_record(folder)
     if record is not None and any(row["values"] for row in record.settings):
-        return sweep_tables(folder)
+        return sweep_tables(folder, paper, only)
     return run_tables(folder, paper, only)
+
+
+def _made_tables(runs: list[Run], policies: list[str], paper: str | None) -> dict[str, Table]:
+    made = {name: make(runs, policies) for name, make in RUN_TABLES.items()}
+    if paper is not None:
+        made["paper"] = paper_table(runs, policies, paper)
+    return {name: table for name, table in made.items() if table is not None}
+
+
+def _setting(folder: pathlib.Path, row: dict, only: Sequence[str]) -> Setting:
+    """What there is so far of a setting, of the policies that are shown."""
+    path = folder / row["folder"]
+    runs = load_runs(path) if (path / "summary.json").exists() else []
+    policies = [p for p in only or row["policies"] if p in row["policies"]]
+    shown = [run for run in runs if run.policy in policies]
+    return Setting(row["folder"], row["values"], policies, shown)
 
 
 def _runs_of(folder: pathlib.Path, only: Sequence[str]) -> list[Run]:
@@ -125,10 +151,6 @@ def _runs_of(folder: pathlib.Path, only: Sequence[str]) -> list[Run]:
         if policy not in known:
             raise ReportError(f"{folder}: no run of {policy}; there are {', '.join(known)}")
     return [run for policy in only or known for run in runs if run.policy == policy]
-
-
-def _runs_so_far(folder: pathlib.Path) -> list[Run]:
-    return load_runs(folder) if (folder / "summary.json").exists() else []
 
 
 def _setting_row(record: Record, folder: str) -> dict:

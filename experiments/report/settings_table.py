@@ -22,59 +22,73 @@ class Setting:
     runs: list[Run]  # empty where there is no result yet
 
 
-def settings_table(settings: list[Setting]) -> Table:
+def settings_table(settings: list[Setting], *, compared: bool = True) -> Table:
     """Means over seeds at the end of each setting, with gaps paired by seed.
 
     Options that every setting sets have a column each; where settings differ in what they set, as
     with one change at a time, their names are the first column.
+
+    Args:
+      settings: at least one.
+      compared: whether there is a column of gaps to the first setting.
     """
     options = [*settings[0].values] if len({(*s.values,) for s in settings}) == 1 else []
     measures = [m for m in stats.MEASURES if any(_has(s.runs, m.key) for s in settings)]
-    compared = any(REFERENCE in s.policies and len(s.policies) > 1 for s in settings)
+    to_random = any(REFERENCE in s.policies and len(s.policies) > 1 for s in settings)
     head = [*(options or ["setting"]), "policy", "seeds", "views"]
     head += [f"{m.label} ({m.unit})" if m.unit else m.label for m in measures]
-    head += [f"PSNR gap to {REFERENCE} (dB)"] * compared
-    head += [f"PSNR gap to {settings[0].name} (dB)"]
+    head += [f"PSNR gap to {REFERENCE} (dB)"] * to_random
+    head += [f"PSNR gap to {settings[0].name} (dB)"] * compared
     rows = []
     for setting in settings:
         fixed = [Cell(str(setting.values[o])) for o in options] or [Cell(setting.name)]
         for policy in setting.policies:
-            cells = _row(setting, policy, measures, settings[0], compared)
+            cells = _row(setting, policy, measures)
+            if to_random:
+                cells.append(_reference_gap(setting, policy))
+            if compared:
+                cells.append(_setting_gap(setting, settings[0], policy))
             rows.append((*fixed, Cell(policy), *cells))
     return Table(tuple(head), tuple(rows))
 
 
-def _row(setting: Setting, policy: str, measures, first: Setting, compared: bool) -> list[Cell]:
+def _row(setting: Setting, policy: str, measures) -> list[Cell]:
     mine = stats.completed(setting.runs, policy)
     num_views = stats.common_num_views(setting.runs)
     seeds = Cell(str(len(mine)))
     if not mine:
-        empty = dash(f"{setting.name}, {policy}: no completed run")
-        return [seeds, *[empty] * (len(measures) + compared + 2)]
+        return [seeds, *[dash(_no_run(setting, policy))] * (len(measures) + 1)]
     cells = [seeds, Cell(str(num_views)) if num_views is not None else dash("no shared number")]
     for measure in measures:
         interval = stats.over_seeds(setting.runs, policy, measure.key, num_views)
         cells.append(interval_cell(interval, measure.digits, missing_measure(measure, mine)))
-    if compared:
-        cells.append(_reference_gap(setting, policy, num_views))
-    cells.append(_setting_gap(setting, first, policy, num_views))
     return cells
 
 
-def _reference_gap(setting: Setting, policy: str, num_views) -> Cell:
+def _no_run(setting: Setting, policy: str) -> str:
+    return f"{setting.name}, {policy}: no completed run"
+
+
+def _reference_gap(setting: Setting, policy: str) -> Cell:
+    if not stats.completed(setting.runs, policy):
+        return dash(_no_run(setting, policy))
     if policy == REFERENCE:
         return dash("a policy has no gap to itself")
+    num_views = stats.common_num_views(setting.runs)
     pair = stats.compare(setting.runs, policy, REFERENCE, "psnr", num_views)
     why = f"{setting.name}: {policy} and {REFERENCE} share no seed"
     return interval_cell(pair.gap if pair else None, 2, why, gap=True)
 
 
-def _setting_gap(setting: Setting, first: Setting, policy: str, num_views) -> Cell:
+def _setting_gap(setting: Setting, first: Setting, policy: str) -> Cell:
     """Each at its own last number of views: an option may change how many there are."""
+    if not stats.completed(setting.runs, policy):
+        return dash(_no_run(setting, policy))
     if setting is first:
         return dash("a setting has no gap to itself")
-    ours = _by_seed(setting.runs, policy, num_views)
-    theirs = _by_seed(first.runs, policy, stats.common_num_views(first.runs))
+    ours, theirs = (
+        _by_seed(one.runs, policy, stats.common_num_views(one.runs)) for one in (setting, first)
+    )
     gaps = [value - theirs[seed] for seed, value in ours.items() if seed in theirs]
     why = f"{policy}: {setting.name} and {first.name} share no seed"
     return interval_cell(stats.mean_interval(gaps), 2, why, gap=True)
