@@ -56,6 +56,11 @@ def write_figures(
     runs = [run for run in runs if run.policy in shown]
     coloured = gaps.in_colour(runs, shown, focus_policy(shown))
     figures = {m.key: quality_figure(runs, shown, m, coloured) for m in stats.MEASURES}
+    for figure in filter(None, figures.values()):
+        # A page says this beside the figure; a file has to say it itself.
+        scene = runs[0].result["scene"]["name"]
+        what = f"training views of {scene} (thin: each seed; band: 95 % interval)"
+        figure.axes[0].set_xlabel(what, fontsize=9)
     pictures = _pictures(runs, shown)
     figures["views"] = views_figure(pictures, num_views) if pictures else None
     written = []
