@@ -13,7 +13,7 @@ import pytest
 
 from bavs_jax.selection.policies import POLICIES
 from experiments.errors import ConfigError, WorkdirError
-from experiments.remeasure import Wanted, remeasure
+from experiments.posthoc.measures import Wanted, remeasure
 from experiments.report.collected import collect_tables
 from tests.toy_runs import toy_flags
 

@@ -1,0 +1,121 @@
+"""LPIPS for runs that have ended without it, from the fields that they left behind."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from experiments import runtime, workdir
+from experiments.build import Problem, build_problem
+from experiments.build_scene import load_config_scene
+from experiments.errors import ConfigError, WorkdirError
+from experiments.evaluate import evaluate_views, spread_evenly
+from experiments.files import write_json
+from experiments.progress import track
+from experiments.report import write_report
+from experiments.sweeps.record import read_record
+from experiments.trained import TrainedRun, field_kind, find_runs, load_run, saved_config
+
+PSNR_TOLERANCE = 0.02  # dB; another machine adds up in another order
+
+
+class Wanted(NamedTuple):
+    """What to measure, as the flags say."""
+
+    lpips_net: str = "alex"
+    policies: Sequence[str] = ()  # none: all
+    data_dir: str = ""  # empty: where the runs had it
+
+
+def remeasure(folder: pathlib.Path, wanted: Wanted, command: str) -> None:
+    """Every setting of a sweep, or the one experiment that the folder holds.
+
+    Raises:
+      ConfigError: LPIPS is not installed, or there is no finished run of a policy.
+      WorkdirError, SceneError: the folder or the scene cannot be used.
+    """
+    record = read_record(folder)
+    rows = [] if record is None else record.settings
+    for setting in [folder / row["folder"] for row in rows] or [folder]:
+        _measure_folder(setting, wanted, command)
+
+
+def _measure_folder(folder: pathlib.Path, wanted: Wanted, command: str) -> None:
+    config = saved_config(folder)
+    config.lpips_net = wanted.lpips_net
+    config.data_dir = wanted.data_dir or config.data_dir
+    todo = _runs_without(folder, wanted)
+    if not todo:
+        print(f"{folder}: nothing is left to measure")
+        return
+    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    problems: dict[str, Problem] = {}
+    for number, (policy, seed) in enumerate(todo):
+        kind = field_kind(policy)
+        if kind not in problems:
+            problems[kind] = build_problem(config, scene, kind)
+        if problems[kind].lpips_fn is None:
+            raise ConfigError(f"--lpips_net: {problems[kind].lpips_reason}")
+        run = load_run(config, problems[kind], folder, policy, seed)
+        measure_run(run, f"{policy} seed {seed} ({number + 1} of {len(todo)})", command)
+    workdir.collect(folder)
+    print(f"report: {write_report(folder)}")
+
+
+def measure_run(run: TrainedRun, label: str, command: str) -> None:
+    """Measures one run's last field and rewrites its result file.
+
+    Raises:
+      WorkdirError: the field does not have the PSNR that its result file says.
+    """
+    scene = run.problem.scene
+    view_ids = spread_evenly(scene.test, run.config.num_test_final)
+    num_pixels = int(sum(np.diff(scene.offsets)[view_ids]))
+    with track(num_pixels, f"{label}: {len(view_ids)} test views", "rays") as bar:
+        measures = evaluate_views(
+            run.problem.render(run.state.train),
+            scene,
+            view_ids,
+            lpips_fn=run.problem.lpips_fn,
+            progress_fn=bar.advance,
+        )
+    path = run.folder / "result.json"
+    result = json.loads(path.read_text(encoding="utf-8"))
+    before = result["rounds"][-1]["psnr"]
+    if not abs(measures["psnr"] - before) < PSNR_TOLERANCE:
+        raise WorkdirError(
+            f"{path}: psnr: the run had {before:.2f} dB, its checkpoint has "
+            f"{measures['psnr']:.2f} dB on the views that are there now: give the run's own scene "
+            "with --data_dir"
+        )
+    result["rounds"][-1] |= {"lpips": measures["lpips"]}
+    result |= {"lpips_reason": None, "lpips_net": run.config.lpips_net, "remeasured_by": command}
+    write_json(path, result)
+    print(f"{label}: LPIPS {measures['lpips']:.4f}, PSNR {measures['psnr']:.2f} dB as before")
+
+
+def _runs_without(folder: pathlib.Path, wanted: Wanted) -> list[tuple[str, int]]:
+    """(policy, seed) of the runs that have ended and lack this network's LPIPS."""
+    results = {}
+    for policy, seed in find_runs(folder):
+        path = folder / policy / f"seed_{seed}" / "result.json"
+        if path.exists():
+            result = json.loads(path.read_text(encoding="utf-8"))
+            results |= {(policy, seed): result} if result["completed"] else {}
+    for policy in wanted.policies:
+        if policy not in {name for name, _ in results}:
+            raise ConfigError(f"--policy: {policy}: {folder} holds no finished run of it")
+    return [
+        (policy, seed)
+        for (policy, seed), result in results.items()
+        if policy in (wanted.policies or (policy,)) and not _is_measured(result, wanted.lpips_net)
+    ]
+
+
+def _is_measured(result: dict, lpips_net: str) -> bool:
+    net = result.get("lpips_net", result["config"]["lpips_net"])
+    return net == lpips_net and result["rounds"][-1]["lpips"] is not None
