@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import signal
 import subprocess
 import sys
 import time
@@ -11,7 +12,16 @@ ROOT = pathlib.Path(__file__).parents[1]
 
 
 def start_sweep(flags):
-    """The script, as a process of its own."""
+    """The script, as a process of its own that ctrl-C reaches."""
+    # A shell lets its background jobs ignore it, and so would all that these start.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return _started(flags)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _started(flags):
     return subprocess.Popen(
         [sys.executable, "-m", "experiments.sweep", *flags],
         cwd=ROOT,
