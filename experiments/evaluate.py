@@ -9,6 +9,7 @@ from bavs_jax.metrics.depth import depth_mae
 from bavs_jax.metrics.image import measure_images
 from bavs_jax.rendering.images import render_views
 from experiments.build import RENDER_CHUNK
+from experiments.progress import track
 
 
 def spread_evenly(view_ids, num: int) -> np.ndarray:
@@ -48,6 +49,28 @@ def evaluate_views(render_fn, scene, view_ids, *, lpips_fn=None, progress_fn=Non
     means = mean_quality(scene, view_ids, images, lpips_fn=lpips_fn)
     thinned = float(np.mean([image["thinned"].mean() for image in images]))
     return {**means, "thinned": thinned, "num_test_views": len(images)}
+
+
+def measure_test_views(problem, train, num: int, label: str) -> dict:
+    """`evaluate_views` of a trained field on `num` test views of its problem, with progress.
+
+    Args:
+      problem: from `build_problem`.
+      train: `TrainState`.
+      num: of the test views; see `spread_evenly`.
+      label: of the progress bar.
+    """
+    scene = problem.scene
+    view_ids = spread_evenly(scene.test, num)
+    num_pixels = int(sum(np.diff(scene.offsets)[view_ids]))
+    with track(num_pixels, f"{label}: {len(view_ids)} test views", "rays") as bar:
+        return evaluate_views(
+            problem.render(train),
+            scene,
+            view_ids,
+            lpips_fn=problem.lpips_fn,
+            progress_fn=bar.advance,
+        )
 
 
 def mean_quality(scene, view_ids, images: list[dict], *, lpips_fn=None) -> dict:

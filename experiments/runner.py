@@ -19,7 +19,7 @@ from experiments import acquisitions
 from experiments.baselines import measure_baselines
 from experiments.build import Problem, run_key
 from experiments.build_scene import initial_views
-from experiments.evaluate import evaluate_views, picture_arrays, spread_evenly
+from experiments.evaluate import measure_test_views, picture_arrays, spread_evenly
 from experiments.files import append_line, write_arrays, write_json
 from experiments.machine import device_name, peak_memory_mb, versions
 from experiments.parts import Part
@@ -144,19 +144,9 @@ class Run:
             print(f"{self.label}: {bound_words(self.pending['batch_bound'])}")
 
     def _measure_round(self, state: ActiveState, *, is_last: bool) -> None:
-        config, scene = self.config, self.problem.scene
         start = time.monotonic()
-        num = config.num_test_final if is_last else config.num_test
-        view_ids = spread_evenly(scene.test, num)
-        num_pixels = int(sum(np.diff(scene.offsets)[view_ids]))
-        with track(num_pixels, f"{self.label}: {len(view_ids)} test views", "rays") as bar:
-            measures = evaluate_views(
-                self.problem.render(state.train),
-                scene,
-                view_ids,
-                lpips_fn=self.problem.lpips_fn,
-                progress_fn=bar.advance,
-            )
+        num = self.config.num_test_final if is_last else self.config.num_test
+        measures = measure_test_views(self.problem, state.train, num, self.label)
         pending = self.pending
         if int(state.round) == 0:
             pending["selected"] = self.initial.tolist()

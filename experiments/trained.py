@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import pathlib
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -12,9 +12,8 @@ from ml_collections import ConfigDict
 
 from bavs_jax.active import ActiveState
 from bavs_jax.selection.policies import POLICIES, get_policy
-from bavs_jax.uncertainty.channel import vertex_variance
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation, Toolbox
-from bavs_jax.uncertainty.models.laplace import training_curvature
+from bavs_jax.uncertainty.models.laplace import laplace_variance, training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
 from experiments.build import Problem, run_key
 from experiments.build_trainer import KINDS
@@ -198,22 +197,18 @@ def run_curvature(run: TrainedRun) -> jax.Array:
 
 def run_variance(run: TrainedRun, jac_sq_sum: jax.Array) -> jax.Array:
     """The vertex variance [G] that the run's uncertainty channel interpolates."""
-    options = _posterior_options(run)
-    return vertex_variance(jac_sq_sum, **options, variant=run.toolbox.laplace.variant)
+    return laplace_variance(jac_sq_sum, run.num_rays, run.toolbox.laplace)
 
 
 def run_precision(run: TrainedRun, jac_sq_sum: jax.Array) -> jax.Array:
     """H of the run's posterior, [G, 3] (Eq 13)."""
-    return posterior_precision(jac_sq_sum, **_posterior_options(run))
-
-
-def _posterior_options(run: TrainedRun) -> dict[str, Any]:
     options = run.toolbox.laplace
-    return {
-        "num_rays": run.num_rays,
-        "prior_weight": options.prior_weight,
-        "weighting": options.weighting,
-    }
+    return posterior_precision(
+        jac_sq_sum,
+        num_rays=run.num_rays,
+        prior_weight=options.prior_weight,
+        weighting=options.weighting,
+    )
 
 
 def _first_round_kind(name: str) -> str | None:

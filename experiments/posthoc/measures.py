@@ -7,15 +7,12 @@ import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
-
 from experiments import runtime, workdir
 from experiments.build import Problem, build_problem
 from experiments.build_scene import load_config_scene
 from experiments.errors import ConfigError, WorkdirError
-from experiments.evaluate import evaluate_views, spread_evenly
+from experiments.evaluate import measure_test_views
 from experiments.files import write_json
-from experiments.progress import track
 from experiments.report import write_report
 from experiments.sweeps.record import read_record
 from experiments.trained import TrainedRun, field_kind, find_runs, load_run, saved_config
@@ -72,17 +69,8 @@ def measure_run(run: TrainedRun, label: str, command: str) -> None:
     Raises:
       WorkdirError: the field does not have the PSNR that its result file says.
     """
-    scene = run.problem.scene
-    view_ids = spread_evenly(scene.test, run.config.num_test_final)
-    num_pixels = int(sum(np.diff(scene.offsets)[view_ids]))
-    with track(num_pixels, f"{label}: {len(view_ids)} test views", "rays") as bar:
-        measures = evaluate_views(
-            run.problem.render(run.state.train),
-            scene,
-            view_ids,
-            lpips_fn=run.problem.lpips_fn,
-            progress_fn=bar.advance,
-        )
+    num = run.config.num_test_final
+    measures = measure_test_views(run.problem, run.state.train, num, label)
     path = run.folder / "result.json"
     result = json.loads(path.read_text(encoding="utf-8"))
     before = result["rounds"][-1]["psnr"]

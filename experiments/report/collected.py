@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from experiments.report.formats import FORMATS, latex_text
 from experiments.report.over_scenes import mean_runs
 from experiments.report.paper_table import paper_table
-from experiments.report.results import ReportError, Run, load_runs
+from experiments.report.results import ReportError, Run, load_runs, load_runs_of
 from experiments.report.settings_table import Setting, settings_table
 from experiments.report.tables import (
     Table,
@@ -74,7 +74,7 @@ def run_tables(
     Raises:
       ReportError: a file that cannot be used, or one of `only` without a run.
     """
-    runs, record = _runs_of(folder, only), read_record(folder)
+    runs, record = load_runs_of(folder, only), read_record(folder)
     policies = list(dict.fromkeys(run.policy for run in runs))
     notes: tuple[str, ...] = ()
     if record is not None:
@@ -142,15 +142,6 @@ def _setting(folder: pathlib.Path, row: dict, only: Sequence[str]) -> Setting:
     policies = [p for p in only or row["policies"] if p in row["policies"]]
     shown = [run for run in runs if run.policy in policies]
     return Setting(row["folder"], row["values"], policies, shown)
-
-
-def _runs_of(folder: pathlib.Path, only: Sequence[str]) -> list[Run]:
-    runs = load_runs(folder)
-    known = dict.fromkeys(run.policy for run in runs)
-    for policy in only:
-        if policy not in known:
-            raise ReportError(f"{folder}: no run of {policy}; there are {', '.join(known)}")
-    return [run for policy in only or known for run in runs if run.policy == policy]
 
 
 def _setting_row(record: Record, folder: str) -> dict:

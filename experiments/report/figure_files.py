@@ -9,7 +9,7 @@ from experiments.report import gaps, stats
 from experiments.report.headline import focus_policy
 from experiments.report.panels import save_figure
 from experiments.report.plots import quality_figure
-from experiments.report.results import ReportError, Run, load_pictures, load_runs
+from experiments.report.results import Run, load_pictures, load_runs_of
 from experiments.report.views_figure import views_figure
 
 FORMATS = ("pdf", "png", "svg")
@@ -32,13 +32,8 @@ def write_figures(
     Raises:
       ReportError: a file that cannot be used, or a policy without a run.
     """
-    runs = load_runs(workdir)
-    known = list(dict.fromkeys(run.policy for run in runs))
-    for policy in policies:
-        if policy not in known:
-            raise ReportError(f"{workdir}: no run of {policy}; there are {', '.join(known)}")
-    shown = [*(policies or known)]
-    runs = [run for run in runs if run.policy in shown]
+    runs = load_runs_of(workdir, policies)
+    shown = list(dict.fromkeys(run.policy for run in runs))
     coloured = gaps.in_colour(runs, shown, focus_policy(shown))
     figures = {m.key: quality_figure(runs, shown, m, coloured) for m in stats.MEASURES}
     for figure in filter(None, figures.values()):

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from experiments.report import stats
 from experiments.report.results import ReportError, Run
 
 
@@ -22,7 +23,7 @@ def mean_runs(runs_of_scenes: list[list[Run]]) -> list[Run]:
       ReportError: scenes were measured at different numbers of views.
     """
     by_scene = [
-        {(r.policy, r.seed): r for r in runs if r.completed and r.rounds} for runs in runs_of_scenes
+        {(run.policy, run.seed): run for run in stats.completed(runs)} for runs in runs_of_scenes
     ]
     shared = [key for key in by_scene[0] if all(key in others for others in by_scene)]
     return [_mean_run([runs[key] for runs in by_scene]) for key in shared]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -73,6 +74,20 @@ def load_runs(workdir: Path) -> list[Run]:
     if len(scenes) > 1:
         raise ReportError(f"{path}: scene differs ({', '.join(scenes)}); use one workdir per scene")
     return runs
+
+
+def load_runs_of(workdir: Path, policies: Sequence[str]) -> list[Run]:
+    """The runs of some policies, in the order of these; of all where none is named.
+
+    Raises:
+      ReportError: see `load_runs`; or a policy has no run.
+    """
+    runs = load_runs(workdir)
+    known = dict.fromkeys(run.policy for run in runs)
+    for policy in policies:
+        if policy not in known:
+            raise ReportError(f"{workdir}: no run of {policy}; there are {', '.join(known)}")
+    return [run for policy in policies or known for run in runs if run.policy == policy]
 
 
 def _load_run(result: dict, path: Path) -> Run:
