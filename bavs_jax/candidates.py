@@ -71,7 +71,7 @@ def captured_candidates(
 
     Args:
       scene: the scene, with empty views from `first_slot` on (see `with_empty_views`).
-      capture_fn: `Cameras` [k] -> pixels [k * H * W, 3] uint8.
+      capture_fn: `Cameras` [k] -> (pixels [k * H * W, 3], alpha [k * H * W]), both uint8.
       num_candidates: C.
       first_slot: first view that a picture may be put into.
     """
@@ -97,7 +97,7 @@ def captured_candidates(
                 f"{len(selected)} pictures; make room for more with with_empty_views"
             )
         chosen = take(candidates.cameras, selected)
-        return _write_views(table, view_ids, chosen, capture_fn(chosen)), view_ids
+        return _write_views(table, view_ids, chosen, *capture_fn(chosen)), view_ids
 
     return CandidateSource(propose, acquire)
 
@@ -119,21 +119,29 @@ def with_empty_views(table: PixelTable, num: int) -> PixelTable:
         lambda x: jnp.concatenate([x, jnp.repeat(x[:1], num, axis=0)]), table.cameras
     )
     blank = jnp.zeros((num * first, 3), jnp.uint8)
-    mask = table.pixel_mask
+    mask, alpha = table.pixel_mask, table.alpha
     if mask.shape[0] > 1:
         mask = jnp.concatenate([mask, jnp.ones(num * first, bool)])
+    if alpha.shape[0] > 1:
+        alpha = jnp.concatenate([alpha, jnp.full(num * first, 255, jnp.uint8)])
     more = table.offsets[-1] + first * jnp.arange(1, num + 1)
     return PixelTable(
         cameras=cameras,
         pixels=jnp.concatenate([table.pixels, blank]),
         pixel_mask=mask,
         offsets=jnp.concatenate([table.offsets, more]),
+        alpha=alpha,
     )
 
 
-def _write_views(table: PixelTable, view_ids, cameras: Cameras, pixels) -> PixelTable:
-    """Puts pictures and their cameras into views of the same size."""
+def _write_views(table: PixelTable, view_ids, cameras: Cameras, pixels, alpha) -> PixelTable:
+    """Puts pictures and their cameras into views of the same size.
+
+    In a table without alpha all pictures count as opaque.
+    """
     starts, ends = np.asarray(table.offsets)[view_ids], np.asarray(table.offsets)[view_ids + 1]
     rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, ends)])
     merged = jax.tree.map(lambda old, new: old.at[view_ids].set(new), table.cameras, cameras)
+    if table.alpha.shape[0] > 1:
+        table = table.replace(alpha=table.alpha.at[rows].set(alpha))
     return table.replace(cameras=merged, pixels=table.pixels.at[rows].set(pixels))

@@ -94,7 +94,7 @@ def build_flow(config, scene: Scene) -> FlowField:
     """The distribution over fields that goes with a config's kind of field."""
     common = {"contracted": scene.unbounded, **config.flow}
     if config.field_kind == "hash_grid":
-        grid = {k: v for k, v in config.field.items() if k != "appearance_features"}
+        grid = {k: v for k, v in config.field.items() if k not in ("appearance_features", "initial_density")}
         return make_flow_field(scene.box, **grid, **common)
     trunk = config[config.field_kind]
     shape = {k: trunk[k] for k in ("depth", "width", "skip", "position_degree", "direction_degree")}

@@ -72,7 +72,7 @@ def make_source(config, scene: Scene, table: PixelTable) -> tuple[CandidateSourc
     table = with_empty_views(table, config.num_rounds * config.batch_size)
     source = captured_candidates(
         scene,
-        lambda cameras: capture(cameras)[0],
+        lambda cameras: capture(cameras)[:2],
         num_candidates=draws,
         first_slot=first_slot,
     )

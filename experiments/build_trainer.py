@@ -53,7 +53,7 @@ def build_trainer(
     field, sampler = build_field(config, scene, num_views, learned_variance=kind == VARIANCE)
     train, flow = config.train, None
     capacity = train.capacity // num_shards(mesh)
-    rendering = {"background": field_background(scene), "capacity": capacity, "mesh": mesh}
+    rendering = {"capacity": capacity, "mesh": mesh}
     if kind == FLOW:
         flow = build_flow(config, scene)
         field = mean_field(flow)
@@ -78,6 +78,8 @@ def build_trainer(
         optimiser,
         schedule,
         num_rays=train.num_rays,
+        background=field_background(scene),
+        random_background=train.random_background,
         penalty_weight=train.penalty_weight,
         steps_per_call=train.steps_per_call,
         mesh=mesh,

@@ -266,7 +266,8 @@ def saved_part(problem: Problem, state: ActiveState):
         "round": state.round,
         "calls": state.calls,
         "world_from_cam": state.table.cameras.world_from_cam,
-        "new_pixels": state.table.pixels[first:] if problem.has_empty_views else jnp.zeros(1),
+        **({"new_pixels": state.table.pixels[first:]} if problem.has_empty_views else {}),
+        **({"new_alpha": state.table.alpha[first:]} if problem.has_empty_views else {}),
     }
 
 
@@ -274,12 +275,13 @@ def whole_state(problem: Problem, saved) -> ActiveState:
     """The inverse of `saved_part`."""
     table = problem.table
     cameras = table.cameras.replace(world_from_cam=saved["world_from_cam"])
-    pixels = table.pixels
+    pixels, alpha = table.pixels, table.alpha
     if problem.has_empty_views:
         pixels = pixels.at[problem.first_empty_row :].set(saved["new_pixels"])
+        alpha = alpha.at[problem.first_empty_row :].set(saved["new_alpha"])
     return ActiveState(
         train=saved["train"],
-        table=table.replace(cameras=cameras, pixels=pixels),
+        table=table.replace(cameras=cameras, pixels=pixels, alpha=alpha),
         is_training_view=saved["is_training_view"],
         round=saved["round"],
         calls=saved["calls"],

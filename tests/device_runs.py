@@ -69,7 +69,7 @@ def main(out):
         scene.box, near=scene.near, far=scene.far, num_steps=32, num_slots=24
     )
     sampler = make_occupancy_sampler(scene.box, march, resolution=8)
-    shared = {"background": scene.background, "capacity": CAPACITY // shards, "mesh": mesh}
+    shared = {"capacity": CAPACITY // shards, "mesh": mesh}
     field = make_hash_grid_field(scene.box, **HASH)
     with_variance = make_hash_grid_field(scene.box, **HASH, learned_variance=True)
     flow = make_flow_field(scene.box, **HASH, num_flows=2, condition_features=8)
@@ -110,6 +110,7 @@ def main(out):
     render_chunk = make_render_chunk_fn(
         *(field, sampler, grid),
         **shared,
+        background=scene.background,
         variant="posterior",
         scale="log",
     )

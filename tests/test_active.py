@@ -1,5 +1,6 @@
 """The loop of the paper: rounds, masks, resumption inside a round, captured candidates."""
 
+import dataclasses
 import io
 
 import jax
@@ -109,12 +110,14 @@ def test_hemisphere_draws_snap_to_the_nearest_unused_views():
 
 def test_captured_pictures_go_into_empty_views_until_these_are_full():
     scene = toy_scene()
+    scene = dataclasses.replace(scene, alpha=np.full(len(scene.pixels), 7, np.uint8))
     table = with_empty_views(make_pixel_table(scene), 2)
     taken = []
 
     def capture(cameras):
         taken.append(np.asarray(cameras.world_from_cam))
-        return np.full((len(cameras) * 64, 3), 50 + len(taken), np.uint8)
+        num = len(cameras) * 64
+        return np.full((num, 3), 50 + len(taken), np.uint8), np.full(num, 9, np.uint8)
 
     source = captured_candidates(scene, capture, num_candidates=5, first_slot=12)
     used = jnp.zeros(14, bool).at[0].set(True)
@@ -126,6 +129,7 @@ def test_captured_pictures_go_into_empty_views_until_these_are_full():
     np.testing.assert_allclose(taken[0][0], offered.cameras.world_from_cam[3])
     assert (np.asarray(table.pixels[12 * 64 :]) == 51).all()
     np.testing.assert_array_equal(table.pixels[: 12 * 64], scene.pixels)
+    assert (table.alpha[: 12 * 64] == 7).all() and (table.alpha[12 * 64 :] == 9).all()
     with pytest.raises(ValueError, match="0 empty views left for 1 pictures"):
         source.acquire(table, used.at[view_ids].set(True), offered, np.array([0]))
 

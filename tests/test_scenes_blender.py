@@ -44,7 +44,9 @@ def test_shrinking_keeps_the_field_of_view(tmp_path):
     # Rows shrink by 3 / 7 where columns shrink by 4 / 9.
     np.testing.assert_allclose(fy / fx, (3 / 7) / (4 / 9), rtol=1e-6)
     image = images.read_image(root / "train/r_0.png")
-    np.testing.assert_array_equal(scene.image(0), images.shrink_over(image, 4, 3, (0.0, 0.5, 1.0)))
+    colour, alpha = images.shrink_over(image, 4, 3, (0.0, 0.5, 1.0))
+    np.testing.assert_array_equal(scene.image(0), colour)
+    np.testing.assert_array_equal(scene.alpha[scene.view_slice(0)].reshape(3, 4), alpha)
 
 
 def test_depth_is_read_where_it_exists(tmp_path):

@@ -50,18 +50,21 @@ def test_transparent_colour_never_counts():
         np.uint8,
     )
     # (red + blue) / 4 + half of the background; 191.25 and 127.5 (to even) when rounded.
-    white = images.shrink_over(image, 1, 1, (1.0, 1.0, 1.0))
+    white, alpha = images.shrink_over(image, 1, 1, (1.0, 1.0, 1.0))
     np.testing.assert_array_equal(white[0, 0], [191, 128, 191])
-    black = images.shrink_over(image, 1, 1, (0.0, 0.0, 0.0))
+    np.testing.assert_array_equal(alpha, [[128]])
+    black, _ = images.shrink_over(image, 1, 1, (0.0, 0.0, 0.0))
     np.testing.assert_array_equal(black[0, 0], [64, 0, 64])
-    full = images.shrink_over(image, 2, 2, (1.0, 1.0, 1.0))
+    full, _ = images.shrink_over(image, 2, 2, (1.0, 1.0, 1.0))
     expected = [[[255, 0, 0], [255, 255, 255]], [[0, 0, 255], [255, 255, 255]]]
     np.testing.assert_array_equal(full, expected)
 
 
 def test_opaque_images_ignore_the_background():
     image = random_image(3, 7, 5, 3)
-    np.testing.assert_array_equal(images.shrink_over(image, 7, 5, (0.2, 0.3, 0.4)), image)
+    colour, alpha = images.shrink_over(image, 7, 5, (0.2, 0.3, 0.4))
+    np.testing.assert_array_equal(colour, image)
+    assert alpha is None
 
 
 def test_nearest_resize_invents_no_values_and_takes_centres():

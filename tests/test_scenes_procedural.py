@@ -80,7 +80,7 @@ def test_object_lies_within_its_ball_and_has_an_inside():
 def test_detail_is_uneven():
     """The carved side has much more texture than the smooth one, as selection needs it."""
     cameras = procedural.hemisphere_cameras(jax.random.key(0), 24, image_size=32)
-    pixels, _ = procedural.capture(cameras)
+    pixels, _, _ = procedural.capture(cameras)
     grey = pixels.reshape(24, 32, 32, 3).mean(axis=-1)
     detail = np.abs(np.diff(grey, axis=1)).mean(axis=(1, 2))
     towards_wall = np.asarray(cameras.positions) @ [
@@ -153,12 +153,13 @@ def test_highlights_move_with_the_viewer():
 
 
 def test_captures_of_any_poses_agree_and_compile_nothing_new(captured):
-    cameras, pixels, depth = captured
+    cameras, pixels, alpha, depth = captured
     steps = procedural.compiled_steps()
     compiled = [step._cache_size() for step in steps]
-    other_pixels, other_depth = procedural.capture(take(cameras, np.array([2, 0])))
+    other_pixels, other_alpha, other_depth = procedural.capture(take(cameras, np.array([2, 0])))
     rows = SIZE**2
     np.testing.assert_array_equal(other_pixels, np.r_[pixels[2 * rows :], pixels[:rows]])
+    np.testing.assert_array_equal(other_alpha, np.r_[alpha[2 * rows :], alpha[:rows]])
     np.testing.assert_array_equal(other_depth, np.r_[depth[2 * rows :], depth[:rows]])
     assert [step._cache_size() for step in steps] == compiled
 
@@ -170,10 +171,13 @@ def test_mixed_sizes_and_views_past_the_object():
     cameras = make_cameras(
         [pose, away], [[10.0, 10.0, 4.0, 3.0], [9.0, 9.0, 2.0, 2.0]], [[8, 6], [4, 4]]
     )
-    pixels, depth = procedural.capture(cameras)
+    pixels, alpha, depth = procedural.capture(cameras)
     assert pixels.shape == (48 + 16, 3)
     assert (depth[:48] > 0.0).any()
     np.testing.assert_array_equal(pixels[48:], 255)
+    np.testing.assert_array_equal(alpha[48:], 0)
+    # A pixel whose middle meets the object is at least partly covered, and far from it none is.
+    assert (alpha[:48][depth[:48] > 0.0] > 0).all() and (alpha[:48] == 0).any()
     np.testing.assert_array_equal(depth[48:], 0.0)
 
 

@@ -43,10 +43,11 @@ def trainer():
     train = make_train_fn(
         field,
         sampler,
-        make_colour_objective(field, background=scene.background, capacity=1024),
+        make_colour_objective(field, capacity=1024),
         optimiser,
         schedule,
         num_rays=64,
+        background=scene.background,
         steps_per_call=4,
     )
 
@@ -126,6 +127,43 @@ def test_masked_pixels_have_no_weight():
     view_ids, within = training_pixels(table, np.ones(4, bool))
     assert len(view_ids) == keep.sum()
     assert (keep[scene.offsets[view_ids] + within]).all()
+
+
+def test_random_background_shows_the_same_photos_over_other_colours():
+    scene = toy_scene(num_views=4, num_test=1)
+    rng = np.random.default_rng(0)
+    straight = rng.random((len(scene.pixels), 3))  # colours before anything lies behind them
+    alpha = rng.choice([0, 77, 255], len(straight)).astype(np.uint8)
+    share = (alpha / 255.0)[:, None]
+    over = share * straight + (1.0 - share) * scene.background
+    table = make_pixel_table(scene).replace(
+        pixels=jnp.asarray(np.rint(255.0 * over), jnp.uint8), alpha=jnp.asarray(alpha)
+    )
+    views = jnp.ones(4, bool)
+    plain = sample_pixels(jax.random.key(0), table, views, 500, background=scene.background)
+    drawn = sample_pixels(
+        *(jax.random.key(0), table, views, 500),
+        background=scene.background,
+        random_background=True,
+    )
+    np.testing.assert_array_equal(plain.rays.directions, drawn.rays.directions)  # the same pixels
+    assert np.ptp(drawn.background, axis=0).min() > 0.9  # a colour of its own for each ray
+    # alpha of these pixels, from how far the colours moved with the background
+    moved = np.asarray(drawn.rgb - plain.rgb) / np.asarray(drawn.background - plain.background)
+    seen = np.isin(np.rint(255.0 * (1.0 - moved.mean(-1))), [0, 77, 255])
+    assert seen.all() and len(np.unique(np.rint(255.0 * moved.mean(-1)))) == 3
+    np.testing.assert_array_equal(plain.background, np.ones((500, 3)) * scene.background)
+
+
+def test_opaque_photos_have_no_random_background():
+    scene = toy_scene(num_views=4, num_test=1)
+    table = make_pixel_table(scene)
+    args = (jax.random.key(0), table, jnp.ones(4, bool), 50)
+    plain = sample_pixels(*args, background=scene.background)
+    drawn = sample_pixels(*args, background=scene.background, random_background=True)
+    np.testing.assert_array_equal(plain.rgb, drawn.rgb)
+    np.testing.assert_array_equal(plain.background, drawn.background)
+    assert sample_pixels(*args, background=None, random_background=True).background is None
 
 
 def test_loss_counts_only_weighted_rays():

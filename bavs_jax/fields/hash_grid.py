@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -34,6 +36,7 @@ class HashGridField(nn.Module):
     num_views: int = 0
     appearance_features: int = 0
     learned_variance: bool = False
+    log_density: float = 0.0
 
     def setup(self):
         self.encoding = HashEncoding(self.resolutions, self.features, self.log2_table_size)
@@ -51,7 +54,7 @@ class HashGridField(nn.Module):
     def geometry(self, unit_positions):
         hidden = nn.relu(self.density_hidden(self.encoding(unit_positions)))
         out = self.density_out(hidden)
-        return density_from_raw(out[:, 0]), out[:, 1:]
+        return density_from_raw(out[:, 0] + self.log_density), out[:, 1:]
 
     def codes(self, num: int, view_ids):
         """Appearance codes of `num` points: of their views, or the mean of all trained ones."""
@@ -92,6 +95,7 @@ def make_hash_grid_field(
     num_views: int = 0,
     appearance_features: int = 0,
     learned_variance: bool = False,
+    initial_density: float = 1.0,
 ) -> Field:
     """Makes a hash-grid field over a box, or over contracted space around it.
 
@@ -124,6 +128,7 @@ def make_hash_grid_field(
         num_views=num_views,
         appearance_features=appearance_features,
         learned_variance=learned_variance,
+        log_density=math.log(initial_density),
     )
 
     def to_unit(positions):

@@ -86,8 +86,9 @@ def march(
     """Even steps through the scene box, kept where the cell is occupied.
 
     `t_i = t_enter + (i + jitter) step_size` for `t_i < t_leave`. A ray with more than `num_slots`
-    occupied steps keeps every n-th of them with n times the length, so its whole way is still
-    integrated, more coarsely; such rays are marked in `thinned`.
+    occupied steps has one sample for each n of them, at the jitter's place among these and with
+    their length, so its whole way is still integrated, more coarsely; such rays are marked in
+    `thinned`.
 
     Args:
       rays: R rays.
@@ -110,11 +111,16 @@ def march(
     hits = pack_hits(hit)
     total = hits.total
     stride = jnp.maximum((total + num_slots - 1) // num_slots, 1)
-    count = (total + stride - 1) // stride
-    step = nth_hit(hits, jnp.arange(num_slots) * stride[:, None])
-    sample_mask = jnp.arange(num_slots) < count[:, None]
-    t_mids = t_enter[:, None] + (step + place[:, None]) * step_size
-    deltas = jnp.where(sample_mask, (step_size * stride)[:, None], 0.0)
+    begin = jnp.arange(num_slots) * stride[:, None]
+    group = jnp.clip(total[:, None] - begin, 0, stride[:, None])
+    sample_mask = group > 0
+    # Of each group the step at the jitter's place: were it always the first one, the others
+    # would never be looked at.
+    along = place[:, None] * group
+    nth = jnp.clip(along.astype(jnp.int32), 0, jnp.maximum(group - 1, 0))
+    step = nth_hit(hits, begin + nth)
+    t_mids = t_enter[:, None] + (step + along - nth) * step_size
+    deltas = step_size * group
     return Samples(
         t_mids=jnp.where(sample_mask, t_mids, options.far),
         deltas=deltas,

@@ -35,6 +35,7 @@ class Scene:
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # unit
     depth: np.ndarray | None = None  # [N] float32 distance along the ray, 0 where unknown or empty
     pixel_mask: np.ndarray | None = None  # [N] bool, False: ignore this pixel
+    alpha: np.ndarray | None = None  # [N] uint8 opacity of the photos; None: all opaque
     unbounded: bool = False  # content reaches beyond the box, as in most real captures
     photo_sizes: np.ndarray | None = None  # [V, 2] int32 pixels of the files; None: not reduced
     # [4, 4] float64 similarity from scene coordinates to those of the user's own file.
@@ -87,6 +88,14 @@ def photo_cameras(scene: Scene, cameras: Cameras) -> Cameras:
         for small, whole in zip(np.asarray(scene.cameras.sizes).tolist(), scene.photo_sizes)
     }
     return rescale(cameras, [by_size[tuple(size)] for size in np.asarray(cameras.sizes).tolist()])
+
+
+def alpha_table(views: list[tuple[np.ndarray, np.ndarray | None]]) -> np.ndarray | None:
+    """`Scene.alpha` of views (colour [H, W, 3], opacity [H, W] or None); None where all are opaque."""
+    if all(alpha is None for _, alpha in views):
+        return None
+    opaque = (np.full(colour.shape[:2], 255, np.uint8) for colour, _ in views)
+    return pixel_table([o if a is None else a for (_, a), o in zip(views, opaque)])[0]
 
 
 def pixel_table(images: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

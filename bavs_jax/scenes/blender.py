@@ -9,7 +9,7 @@ import numpy as np
 
 from bavs_jax.cameras import make_cameras
 from bavs_jax.scenes import checks, images
-from bavs_jax.scenes.base import Scene, SceneError, pixel_table
+from bavs_jax.scenes.base import Scene, SceneError, alpha_table, pixel_table
 
 BOX_HALF_SIDE = 1.5  # scene units; the objects of this data set fit into it
 NEAR, FAR = 2.0, 6.0  # scene units
@@ -118,10 +118,11 @@ def load_blender(
             "list it in one"
         )
 
-    pixels, offsets = pixel_table(views["images"])
+    colours = [colour for colour, _ in views["images"]]
+    pixels, offsets = pixel_table(colours)
     depth = None
     if any(d is not None for d in views["depths"]):
-        unknown = (np.zeros(im.shape[:2], np.float32) for im in views["images"])
+        unknown = (np.zeros(im.shape[:2], np.float32) for im in colours)
         depth, _ = pixel_table([u if d is None else d for d, u in zip(views["depths"], unknown)])
     box = np.array([[-BOX_HALF_SIDE] * 3, [BOX_HALF_SIDE] * 3], np.float32)
     return Scene(
@@ -129,7 +130,7 @@ def load_blender(
         cameras=make_cameras(
             views["poses"],
             views["intrinsics"],
-            [(im.shape[1], im.shape[0]) for im in views["images"]],
+            [(im.shape[1], im.shape[0]) for im in colours],
         ),
         pixels=pixels,
         offsets=offsets,
@@ -141,5 +142,6 @@ def load_blender(
         background=np.asarray(background, np.float32),
         names=tuple(views["names"]),
         depth=depth,
+        alpha=alpha_table(views["images"]),
         photo_sizes=np.array(views["sizes"], np.int32),
     )

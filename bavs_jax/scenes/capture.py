@@ -10,7 +10,7 @@ import numpy as np
 
 from bavs_jax.cameras import Cameras, rescale
 from bavs_jax.scenes import checks, images, maps
-from bavs_jax.scenes.base import Scene, SceneError, pixel_table
+from bavs_jax.scenes.base import Scene, SceneError, alpha_table, pixel_table
 from bavs_jax.scenes.extent import scene_extent
 from bavs_jax.scenes.normalise import level_and_scale, transform_poses
 from bavs_jax.scenes.splits import choose_split
@@ -107,12 +107,11 @@ def make_scene(
         unbounded=unbounded,
         path=source,
     )
-    pixels, offsets = pixel_table(
-        [
-            images.shrink_over(images.read_image(file), int(width), int(height), background)
-            for file, (width, height) in zip(capture.files, cameras.sizes)
-        ]
-    )
+    shrunk = [
+        images.shrink_over(images.read_image(file), int(width), int(height), background)
+        for file, (width, height) in zip(capture.files, cameras.sizes)
+    ]
+    pixels, offsets = pixel_table([colour for colour, _ in shrunk])
     return Scene(
         name=capture.root.resolve().name,
         cameras=cameras,
@@ -127,6 +126,7 @@ def make_scene(
         names=tuple(checks.view_name(file, capture.root) for file in capture.files),
         depth=depth_table(capture, cameras, unit),
         pixel_mask=mask_table(capture, cameras),
+        alpha=alpha_table(shrunk),
         unbounded=unbounded,
         photo_sizes=np.asarray(capture.cameras.sizes, np.int32),
         user_from_scene=capture.user_from_file @ np.linalg.inv(scene_from_file),

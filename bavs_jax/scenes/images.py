@@ -171,14 +171,17 @@ def shrink_over(image: np.ndarray, width: int, height: int, background) -> np.nd
       background: [3] sRGB in [0, 1]; unused where there is no alpha.
 
     Returns:
-      [height, width, 3] uint8, rounded to nearest.
+      [height, width, 3] uint8, rounded to nearest, and where there is alpha the opacity
+      [height, width] uint8, else None.
     """
     values = image / 255.0
     if image.shape[-1] == 3:
-        colour = area_resize(values, width, height)
-    else:
-        alpha = values[..., 3:]
-        values[..., :3] *= alpha
-        small = area_resize(values, width, height)
-        colour = small[..., :3] + (1.0 - small[..., 3:]) * np.asarray(background)
-    return np.rint(np.clip(colour, 0.0, 1.0) * 255.0).astype(np.uint8)
+        return _as_bytes(area_resize(values, width, height)), None
+    values[..., :3] *= values[..., 3:]
+    small = area_resize(values, width, height)
+    colour = small[..., :3] + (1.0 - small[..., 3:]) * np.asarray(background)
+    return _as_bytes(colour), _as_bytes(small[..., 3])
+
+
+def _as_bytes(values: np.ndarray) -> np.ndarray:
+    return np.rint(np.clip(values, 0.0, 1.0) * 255.0).astype(np.uint8)

@@ -10,6 +10,7 @@ import pathlib
 import tempfile
 import warnings
 import zipfile
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from bavs_jax.cameras import Cameras, hemisphere_poses, make_cameras, pixel_rays
 from bavs_jax.scenes import sculpture, sdf
 from bavs_jax.scenes.base import Scene, SceneError
 
-SOURCE_VERSION = 2  # raise it when the look of the scene changes: caches are then made anew
+SOURCE_VERSION = 3  # raise it when the look of the scene changes: caches are then made anew
 CAMERA_RADIUS = 3.2  # scene units
 FIELD_OF_VIEW = 0.64  # radians across the width; holds the whole object from every side
 BACKGROUND = (1.0, 1.0, 1.0)
@@ -91,7 +92,7 @@ def first_touch(cameras: Cameras, pixels: jax.Array):
 
 
 def photograph(cameras: Cameras, pixels: jax.Array, t_start: jax.Array, spread: jax.Array):
-    """Red, green, blue [N] in [0, 1], each the mean over a pixel, and depth [N] at its centre."""
+    """Red, green, blue and opacity [N] in [0, 1], means over a pixel, and depth [N] at its centre."""
     offsets = subpixel_offsets()
     num, sub = pixels.shape[0], offsets.shape[0]
     places = (offsets[:, None, :] + pixels[None]).reshape(-1, 2)
@@ -114,6 +115,7 @@ def photograph(cameras: Cameras, pixels: jax.Array, t_start: jax.Array, spread: 
     channels = [
         jnp.where(hit, c, b).reshape(sub, num).mean(axis=0) for c, b in zip(shaded, BACKGROUND)
     ]
+    opacity = hit.astype(jnp.float32).reshape(sub, num).mean(axis=0)
 
     middle = slice(sub // 2 * num, (sub // 2 + 1) * num)
     origins, directions = (tuple(c[middle] for c in v) for v in (origins, directions))
@@ -127,7 +129,7 @@ def photograph(cameras: Cameras, pixels: jax.Array, t_start: jax.Array, spread: 
         min_step=DEPTH_MIN_STEP,
     )
     depth = sdf.bisect(sculpture.distance, origins, directions, t_before, t)
-    return *channels, jnp.where(hit, depth, 0.0)
+    return *channels, opacity, jnp.where(hit, depth, 0.0)
 
 
 def in_chunks(
@@ -151,16 +153,22 @@ def compiled_steps():
     return jax.jit(first_touch), jax.jit(photograph)
 
 
-def capture(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
+class Photos(NamedTuple):
+    """Pictures of the sculpture; rows as in `Scene.pixels`."""
+
+    pixels: np.ndarray  # [N, 3] uint8 sRGB over white, each the mean of 3 x 3 rays
+    alpha: np.ndarray  # [N] uint8 share of these rays that meet the sculpture
+    depth: np.ndarray  # [N] float32 distance along the ray through the centre, 0 where it meets none
+
+
+def capture(cameras: Cameras) -> Photos:
     """Takes pictures of the sculpture from any poses, as an active robot would.
 
     Args:
       cameras: V cameras with any lens, outside of the object; sizes may differ.
 
     Returns:
-      `(pixels, depth)`: [N, 3] uint8 sRGB over white, each the mean of 3 x 3 rays, and [N] float32
-      distance along the ray through the pixel's centre, 0 where it meets nothing; rows as in
-      `Scene.pixels`.
+      `Photos` of N pixels.
     """
     touch_fn, photograph_fn = compiled_steps()
     cameras = jax.tree.map(np.asarray, cameras)
@@ -173,15 +181,16 @@ def capture(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
 
     t_start, touches, spread = in_chunks(touch_fn, cameras, view_ids, [centres], CONE_CHUNK)
     colours = np.tile(np.float32(BACKGROUND), (len(row), 1))
-    depth = np.zeros(len(row), np.float32)
+    opacity, depth = np.zeros(len(row), np.float32), np.zeros(len(row), np.float32)
     seen = np.flatnonzero(touches)
     if len(seen):
         arrays = [centres[seen], t_start[seen], spread[seen]]
-        *channels, depth[seen] = in_chunks(
+        *channels, opacity[seen], depth[seen] = in_chunks(
             photograph_fn, cameras, view_ids[seen], arrays, RAY_CHUNK
         )
         colours[seen] = np.stack(channels, axis=-1)
-    return np.rint(255.0 * colours).astype(np.uint8), depth
+    pixels, alpha = (np.rint(255.0 * x).astype(np.uint8) for x in (colours, opacity))
+    return Photos(pixels, alpha, depth)
 
 
 def hemisphere_cameras(key: jax.Array, num: int, *, image_size: int) -> Cameras:
@@ -192,29 +201,31 @@ def hemisphere_cameras(key: jax.Array, num: int, *, image_size: int) -> Cameras:
     return make_cameras(poses, intrinsics, [[image_size, image_size]] * num)
 
 
-def read_cache(path: pathlib.Path, num_pixels: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Pixels and depth from a cache file; None, after a warning, where it is damaged."""
+def read_cache(path: pathlib.Path, num_pixels: int) -> Photos | None:
+    """Photos from a cache file; None, after a warning, where it is damaged."""
     try:
         with np.load(path, allow_pickle=False) as data:
-            pixels, depth = data["pixels"], data["depth"]
+            photos = Photos(*(data[name] for name in Photos._fields))
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         warnings.warn(f"{path}: cache is damaged ({error}): made anew", stacklevel=3)
         return None
-    if pixels.shape != (num_pixels, 3) or depth.shape != (num_pixels,):
-        warnings.warn(f"{path}: cache has the wrong shape {pixels.shape}: made anew", stacklevel=3)
+    if [x.shape for x in photos] != [(num_pixels, 3), (num_pixels,), (num_pixels,)]:
+        warnings.warn(
+            f"{path}: cache has the wrong shape {photos.pixels.shape}: made anew", stacklevel=3
+        )
         return None
-    return pixels, depth
+    return photos
 
 
-def write_cache(path: pathlib.Path, pixels: np.ndarray, depth: np.ndarray) -> None:
+def write_cache(path: pathlib.Path, photos: Photos) -> None:
     """Writes a cache file in one go: a reader sees all of it or nothing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
     try:
         with os.fdopen(handle, "wb") as file:
-            np.savez(file, pixels=pixels, depth=depth)
+            np.savez(file, **photos._asdict())
         os.replace(temporary, path)
     except BaseException:
         os.unlink(temporary)
@@ -263,14 +274,14 @@ def load_procedural(
         digest = hashlib.sha256(json.dumps(arguments).encode()).hexdigest()[:16]
         path = pathlib.Path(cache_dir).expanduser() / f"procedural-{digest}.npz"
         cached = read_cache(path, num_views * image_size**2)
-    pixels, depth = capture(cameras) if cached is None else cached
+    photos = capture(cameras) if cached is None else cached
     if path is not None and cached is None:
-        write_cache(path, pixels, depth)
+        write_cache(path, photos)
 
     return Scene(
         name="procedural",
         cameras=cameras,
-        pixels=pixels,
+        pixels=photos.pixels,
         offsets=np.arange(num_views + 1, dtype=np.int64) * image_size**2,
         pool=np.arange(num_train, dtype=np.int32),
         test=np.arange(num_train, num_views, dtype=np.int32),
@@ -282,5 +293,6 @@ def load_procedural(
             [f"train_{i:03d}" for i in range(num_train)]
             + [f"test_{i:03d}" for i in range(num_test)]
         ),
-        depth=depth,
+        depth=photos.depth,
+        alpha=photos.alpha,
     )

@@ -19,6 +19,8 @@ class PixelTable:
     pixels: jax.Array  # [N, 3] uint8
     pixel_mask: jax.Array  # [N] bool, or [1] when every pixel counts
     offsets: jax.Array  # [V + 1] int32
+    # [N] uint8 opacity of the photos, which `pixels` show over the background; [1] if all opaque.
+    alpha: jax.Array
 
 
 def make_pixel_table(scene: Scene) -> PixelTable:
@@ -32,11 +34,13 @@ def make_pixel_table(scene: Scene) -> PixelTable:
             f"{scene.name}: {scene.offsets[-1]} pixels exceed 2^31; use smaller images"
         )
     mask = np.ones(1, bool) if scene.pixel_mask is None else scene.pixel_mask
+    alpha = np.full(1, 255, np.uint8) if scene.alpha is None else scene.alpha
     return PixelTable(
         cameras=jax.tree.map(jnp.asarray, scene.cameras),
         pixels=jnp.asarray(scene.pixels),
         pixel_mask=jnp.asarray(mask),
         offsets=jnp.asarray(scene.offsets, jnp.int32),
+        alpha=jnp.asarray(alpha),
     )
 
 
@@ -48,18 +52,31 @@ class PixelBatch:
     rgb: jax.Array  # [R, 3] true colours in [0, 1]
     ray_weight: jax.Array  # [R], 0 for masked pixels
     view_ids: jax.Array  # [R] int32
+    background: jax.Array | None  # [R, 3] colour behind everything; see `composite_colour`
 
 
 def sample_pixels(
-    key: jax.Array, table: PixelTable, is_training_view: jax.Array, num_rays: int
+    key: jax.Array,
+    table: PixelTable,
+    is_training_view: jax.Array,
+    num_rays: int,
+    *,
+    background=None,
+    random_background: bool = False,
 ) -> PixelBatch:
     """Uniform over all pixels of the training views, with replacement.
+
+    With `random_background`, each ray gets a background of its own, uniform in colour, wherever
+    photos have alpha: `rgb + (1 - alpha) (b' - b)`. Fog of the background's colour then costs as
+    much as any other, where over one fixed colour it explains an empty pixel for nothing.
 
     Args:
       key: random key.
       table: the scene's pixels.
       is_training_view: bool [V], at least one true.
       num_rays: R.
+      background: b [3], which the photos are shown over; None: see `composite_colour`.
+      random_background: see above; does nothing where photos are opaque.
 
     Returns:
       A batch of R pixels.
@@ -74,7 +91,15 @@ def sample_pixels(
         weight = jnp.ones(num_rays)
     else:
         weight = table.pixel_mask[table.offsets[view_ids] + within].astype(jnp.float32)
-    return PixelBatch(rays, pixel_colours(table, view_ids, within), weight, view_ids)
+    rgb = pixel_colours(table, view_ids, within)
+    if background is not None:
+        background = jnp.broadcast_to(jnp.asarray(background, jnp.float32), rgb.shape)
+    if random_background and background is not None and table.alpha.shape[0] > 1:
+        seen_through = 1.0 - table.alpha[table.offsets[view_ids] + within] / 255.0
+        drawn = jax.random.uniform(jax.random.fold_in(key, 1), rgb.shape)
+        rgb = rgb + seen_through[:, None] * (drawn - background)
+        background = drawn
+    return PixelBatch(rays, rgb, weight, view_ids, background)
 
 
 def pixel_colours(table: PixelTable, view_ids: jax.Array, within: jax.Array) -> jax.Array:

@@ -34,13 +34,13 @@ class Outcome(NamedTuple):
     ray_mask: jax.Array  # [R] bool, false for rays that did not fit the sample buffer
 
 
-def _render_batch(field: Field, background, capacity: int, mesh: Mesh | None) -> Callable:
+def _render_batch(field: Field, capacity: int, mesh: Mesh | None) -> Callable:
     def render(params, batch: PixelBatch, samples) -> Rendering:
         return render_rays(
             batch.rays,
             samples,
             partial(field.apply, params),
-            background=background,
+            background=batch.background,
             capacity=capacity,
             exact=False,
             inputs=field.inputs(batch.rays, samples, batch.view_ids),
@@ -49,18 +49,15 @@ def _render_batch(field: Field, background, capacity: int, mesh: Mesh | None) ->
     return over_rays(render, mesh, spread=(False, True, True))
 
 
-def make_colour_objective(
-    field: Field, *, background, capacity: int, mesh: Mesh | None = None
-) -> Callable:
+def make_colour_objective(field: Field, *, capacity: int, mesh: Mesh | None = None) -> Callable:
     """Mean squared colour error (Eq 5).
 
     Args:
       field: the radiance field.
-      background: [3] colour behind everything, or None (see `composite_colour`).
       capacity: places of each device's buffer for valid samples; a dense sampler needs none.
       mesh: devices that share the rays (see `devices.py`).
     """
-    render = _render_batch(field, background, capacity, mesh)
+    render = _render_batch(field, capacity, mesh)
 
     def objective(key, params, batch, samples):
         del key
@@ -74,7 +71,6 @@ def make_colour_objective(
 def make_variance_objective(
     field: Field,
     *,
-    background,
     capacity: int,
     density_weight: float = 0.01,
     through_weights: bool = False,
@@ -93,12 +89,12 @@ def make_variance_objective(
 
     Args:
       field: one whose `apply` also returns `beta`.
-      background, capacity: see `make_colour_objective`.
+      capacity: see `make_colour_objective`.
       density_weight: of the mean density over all slots, which keeps empty space empty.
       through_weights: whether the geometry is moved to make U likelier too, as published.
       mesh: see `make_colour_objective`.
     """
-    render = _render_batch(field, background, capacity, mesh)
+    render = _render_batch(field, capacity, mesh)
 
     def objective(key, params, batch, samples):
         del key
@@ -118,7 +114,6 @@ def make_variance_objective(
 def make_flow_objective(
     flow: FlowField,
     *,
-    background,
     capacity: int,
     num_draws: int = 32,
     entropy_weight: float = 0.01,
@@ -129,7 +124,7 @@ def make_flow_objective(
 
     Args:
       flow: the distribution over fields.
-      background, capacity: see `make_colour_objective`.
+      capacity: see `make_colour_objective`.
       num_draws: K, of the base, shared by all points; new ones in each step.
       entropy_weight, floor: see `flow_loss`.
       mesh: see `make_colour_objective`.
@@ -140,7 +135,7 @@ def make_flow_objective(
             batch.rays,
             samples,
             partial(flow.apply, params, noise=noise),
-            background=background,
+            background=batch.background,
             capacity=capacity,
             exact=False,
         )

@@ -100,6 +100,8 @@ def make_train_fn(
     schedule: Callable,
     *,
     num_rays: int,
+    background=None,
+    random_background: bool = False,
     penalty_weight: float = 0.0,
     steps_per_call: int = 16,
     mesh: Mesh | None = None,
@@ -112,6 +114,7 @@ def make_train_fn(
       objective: what the field is trained for, from `objectives.py`.
       optimiser, schedule: from `make_optimiser`.
       num_rays: R, rays of one step.
+      background, random_background: what rays end at; see `sample_pixels`.
       penalty_weight: of the field's own penalty.
       steps_per_call: optimiser steps compiled together.
       mesh: devices that share the rays (see `devices.py`); the objective must have the same.
@@ -123,7 +126,12 @@ def make_train_fn(
 
     def loss_fn(params, key, sampler_state, table, is_training_view):
         pixel_key, sample_key, objective_key = jax.random.split(key, 3)
-        batch = spread_rays(sample_pixels(pixel_key, table, is_training_view, num_rays), mesh)
+        batch = sample_pixels(
+            *(pixel_key, table, is_training_view, num_rays),
+            background=background,
+            random_background=random_background,
+        )
+        batch = spread_rays(batch, mesh)
         samples, aux = sampler.sample(sample_key, params["sampler"], sampler_state, batch.rays)
         outcome = objective(objective_key, params["field"], batch, samples)
         ray_weight = batch.ray_weight * outcome.ray_mask

@@ -49,6 +49,7 @@ def get_config() -> ConfigDict:
     config.field.log2_table_size = 16
     config.field.width = 64
     config.field.geometry_features = 15
+    config.field.initial_density = 1.0  # 1 / scene unit
     config.field.direction_degree = 2  # spherical-harmonics bands, 1 .. 4
     config.field.appearance_features = 0  # of a code for each view trained on; 0: none
 
@@ -110,6 +111,7 @@ def get_config() -> ConfigDict:
     config.train.num_steps = 3200  # optimiser steps of each round
     config.train.num_rays = 1024
     config.train.capacity = 8192  # samples evaluated in one step
+    config.train.random_background = True  # for each ray, where photos have alpha
     config.train.learning_rate = 0.0  # 0: what suits the field kind
     config.train.final_share = 0.1  # of the learning rate, at the end of a round
     config.train.warmup_steps = 32  # until the learning rate has its full height
