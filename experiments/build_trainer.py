@@ -70,6 +70,7 @@ def build_trainer(
         max_grad_norm=train.max_grad_norm,
         second_decay=train.adam_b2,
         epsilon=train.adam_eps,
+        levels_on=train.levels_on,
     )
     call = make_train_fn(
         field,

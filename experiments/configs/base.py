@@ -90,6 +90,7 @@ def get_config() -> ConfigDict:
     config.march.num_steps = 192  # steps through the diagonal of the scene box
     config.march.num_slots = 64  # most samples of a ray
     config.march.occupancy_resolution = 64
+    config.march.distortion_weight = 0.0
 
     # --- sampler_kind "proposal" (rendering/proposals.py) ---
     config.proposal = ConfigDict()
@@ -115,6 +116,7 @@ def get_config() -> ConfigDict:
     config.train.learning_rate = 0.0  # 0: what suits the field kind
     config.train.final_share = 0.1  # of the learning rate, at the end of a round
     config.train.warmup_steps = 32  # until the learning rate has its full height
+    config.train.levels_on = 0.0  # share of the steps until all levels of hash grids learn
     config.train.max_grad_norm = 0.0  # longer gradients are cut to this; 0: never
     config.train.adam_b2 = 0.99
     config.train.adam_eps = 1e-15
