@@ -10,7 +10,7 @@ import numpy as np
 
 from bavs_jax.cameras import Cameras, rescale
 from bavs_jax.scenes import checks, images, maps
-from bavs_jax.scenes.base import Scene, SceneError, pixel_table
+from bavs_jax.scenes.base import Scene, SceneError, pixel_table, printable
 from bavs_jax.scenes.extent import scene_extent
 from bavs_jax.scenes.normalise import level_and_scale, transform_poses
 from bavs_jax.scenes.splits import choose_split
@@ -89,6 +89,8 @@ def make_scene(
         path=source,
     )
     checks.check_places(capture.poses, source)
+    if scale is not None:
+        scale = checks.check_number(scale, source, "scale", positive=True)
     scene_from_file = level_and_scale(capture.poses, scale=scale)
     unit = float(np.cbrt(np.linalg.det(scene_from_file[:3, :3])))
 
@@ -113,8 +115,10 @@ def make_scene(
             for file, (width, height) in zip(capture.files, cameras.sizes)
         ]
     )
+    depth, pixel_mask = depth_table(capture, cameras, unit), mask_table(capture, cameras)
+    images.look_over(capture.files, capture.root, source)
     return Scene(
-        name=capture.root.resolve().name,
+        name=printable(capture.root.resolve().name),
         cameras=cameras,
         pixels=pixels,
         offsets=offsets,
@@ -125,8 +129,8 @@ def make_scene(
         far=far,
         background=np.asarray(background, np.float32),
         names=tuple(checks.view_name(file, capture.root) for file in capture.files),
-        depth=depth_table(capture, cameras, unit),
-        pixel_mask=mask_table(capture, cameras),
+        depth=depth,
+        pixel_mask=pixel_mask,
         unbounded=unbounded,
         photo_sizes=np.asarray(capture.cameras.sizes, np.int32),
         user_from_scene=capture.user_from_file @ np.linalg.inv(scene_from_file),

@@ -9,7 +9,9 @@ from __future__ import annotations
 import math
 import pathlib
 import struct
+from collections.abc import Iterator
 
+from bavs_jax.scenes import texts
 from bavs_jax.scenes.base import SceneError
 
 # Each model's number of parameters by its number in binary files; the first eleven of COLMAP.
@@ -128,13 +130,21 @@ def check_camera(camera: int, cameras: set[int], path: pathlib.Path, name: str) 
         )
 
 
-def text_lines(path: pathlib.Path) -> list[tuple[int, str]]:
+def text_lines(path: pathlib.Path) -> Iterator[tuple[int, str]]:
     """Numbered lines of a text file, without its comments."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise SceneError(f"{path}: not UTF-8 text ({error.reason}): save it as UTF-8") from error
-    return [(n, line) for n, line in enumerate(lines, start=1) if not line.startswith("#")]
+    return ((n, line) for n, line in texts.text_lines(path) if not line.startswith("#"))
+
+
+def count_images(folder: pathlib.Path) -> int:
+    """How many registered images a model says that it has; 0 where it lacks their file."""
+    binary, text = folder / "images.bin", folder / "images.txt"
+    if binary.is_file():
+        with binary.open("rb") as file:
+            head = file.read(8)
+        return struct.unpack("<Q", head)[0] if len(head) == 8 else 0
+    if not text.is_file():
+        return 0
+    return sum(1 for _ in text_lines(text)) // 2  # two lines an image
 
 
 def check_numbers(words: list[str], path: pathlib.Path, line: int, fields: str) -> list[float]:
@@ -167,7 +177,7 @@ def check_text(folder: pathlib.Path) -> None:
         cameras.add(int(check_numbers([words[0], *words[2:]], path, line, fields)[0]))
 
     path, seen = folder / "images.txt", {}
-    lines = iter(text_lines(path))
+    lines = text_lines(path)
     for line, content in lines:
         words = content.split(maxsplit=9)
         if not words:
