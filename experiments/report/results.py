@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.picture_stack import cut_pictures
 from experiments.versioned import read_versioned
 
 SCHEMA_VERSION = 1
@@ -105,8 +106,9 @@ def _load_run(result: dict, path: Path) -> Run:
 
 
 def load_pictures(run: Run) -> dict[str, np.ndarray] | None:
-    """Test images of a run, or None if it has none (yet)."""
-    return _load_arrays(run.folder / "pictures.npz", PICTURE_KEYS)
+    """Test images of a run, each at its own size, or None if it has none (yet)."""
+    arrays = _load_arrays(run.folder / "pictures.npz", PICTURE_KEYS)
+    return None if arrays is None else cut_pictures(arrays)
 
 
 def load_acquisition(run: Run) -> dict[str, np.ndarray] | None:
