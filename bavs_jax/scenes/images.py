@@ -24,10 +24,11 @@ from bavs_jax.scenes.texts import is_file, one_line
 # What a name without a suffix may mean; some cameras write capitals.
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")  # of what counts as an image in a folder
-# Pillow knows many more, and some of them start other programs (EPS: Ghostscript).
-FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
+# Pillow knows many more, and some of them start other programs (EPS: Ghostscript),
+# and turns TIFF by its orientation.
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP")
 MAX_PIXELS = 100_000_000  # of one image
-MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "I;16", "I;16B", "I")
+MODES = ("1", "L", "LA", "P", "RGB", "RGBA", "I;16", "I")
 STRIP = 1 << 21  # pixels in float64 at a time
 ORIENTATION = 0x0112  # the tag's number in EXIF
 NAMES_IN_WARNING = 3
@@ -113,13 +114,12 @@ def decode(path: pathlib.Path) -> np.ndarray:
             raise SceneError(
                 f"{path}: image has colour model {image.mode}: save it as 8-bit RGB or RGBA"
             )
-        if image.mode in ("P", "PA", "RGBX"):
+        if image.mode == "P":
             image = image.convert("RGBA" if image.has_transparency_data else "RGB")
         mode, values = image.mode, np.array(image)
     if values.dtype == bool:
         return values.astype(np.uint8) * 255
-    # Older Pillow reads 16-bit PNG as "I"; TIFF may be in the other byte order.
-    if mode.startswith("I") and values.min() >= 0 and values.max() < 1 << 16:
+    if mode == "I" and values.min() >= 0 and values.max() < 1 << 16:  # 16-bit PNG in older Pillow
         return values.astype(np.uint16)
     return values
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import pathlib
+import zipfile
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,6 +14,11 @@ from bavs_jax.scenes.base import SceneError
 
 MAX_TEXT_BYTES = 1 << 25  # transforms of some 30,000 frames; parsed, a file grows twenty-fold
 MAX_VALUES = 1 << 26  # of an array
+# What NumPy raises on a damaged .npy file, and on a damaged .npz under that name.
+NPY_DAMAGE = (
+    *(OSError, ValueError, EOFError, OverflowError, TypeError, SyntaxError, RecursionError),
+    *(MemoryError, zipfile.BadZipFile),
+)
 
 
 def is_file(path: pathlib.Path) -> bool:
@@ -93,7 +99,7 @@ def read_array(path: pathlib.Path) -> np.ndarray:
     try:
         # Mapped, so that nothing is allocated for what a header claims.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError, OverflowError, TypeError, SyntaxError) as error:
+    except NPY_DAMAGE as error:
         raise SceneError(
             f"{path}: array cannot be read ({one_line(error)}): save it with np.save"
         ) from error
