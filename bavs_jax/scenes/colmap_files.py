@@ -52,10 +52,14 @@ class Bytes:
 
     def text(self) -> str:
         """A name that ends with a zero byte."""
-        end = self.data.find(b"\0", self.place)
-        start = self.place
+        start, end = self.place, self.data.find(b"\0", self.place)
         self.skip((len(self.data) if end < 0 else end) - start + 1)
-        return self.data[start:end].decode("utf-8", "replace")
+        try:
+            return self.data[start:end].decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise SceneError(
+                f"{self.path}: the name at byte {start} is not UTF-8: rename the image"
+            ) from error
 
     def finish(self) -> None:
         if self.place != len(self.data):
