@@ -70,7 +70,8 @@ def open_image(path: pathlib.Path) -> Iterator[Image.Image]:
         raise SceneError(f"{path}: image is missing: add the file or remove its frame")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # bounded here
+            # Of large images, which are bounded here, and of odd tags, which are not read.
+            warnings.filterwarnings("ignore", module=r"PIL\.")
             with Image.open(path, formats=FORMATS) as image:
                 check_extent(image, path)
                 yield image
