@@ -21,6 +21,7 @@ setup(
     install_requires=[
         "absl-py>=2.1",
         "flax>=0.12",
+        "imageio>=2.34",
         "jax>=0.10",
         "jinja2>=3.1",
         "matplotlib>=3.9",
@@ -39,7 +40,6 @@ setup(
         "ray": ["ray>=2.60"],
         "test": [
             "hypothesis>=6.100",
-            "imageio>=2.34",
             "opencv-python-headless>=4.9",
             "pycolmap>=3.11",
             "pynrrd>=1.1",

@@ -15,6 +15,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Iterator
 
+import imageio.v3 as iio
 import numpy as np
 from PIL import Image
 
@@ -115,9 +116,11 @@ def decode(path: pathlib.Path) -> np.ndarray:
             raise SceneError(
                 f"{path}: image has colour model {image.mode}: save it as 8-bit RGB or RGBA"
             )
-        if image.mode == "P":
-            image = image.convert("RGBA" if image.has_transparency_data else "RGB")
-        mode, values = image.mode, np.array(image)
+        mode = image.mode
+        if mode == "P":  # imageio fails at palettes with transparency
+            values = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+        else:
+            values = iio.imread(path, index=0, plugin="pillow")  # of a phone's MPO the photo
     if values.dtype == bool:
         return values.astype(np.uint8) * 255
     if mode == "I" and values.min() >= 0 and values.max() < 1 << 16:  # 16-bit PNG in older Pillow
