@@ -90,6 +90,8 @@ def _measure(scene, view_id: int, image: dict, lpips_fn) -> dict[str, float]:
     truth = scene.image(view_id).astype(np.float32) / 255.0
     row = _measure_images(image["rgb"], truth, mask=mask, lpips_fn=lpips_fn)
     true_depth = scene.depth_image(view_id)
+    if true_depth is not None and mask is not None:
+        true_depth = np.where(mask, true_depth, 0.0)
     if true_depth is not None and (true_depth > 0).any():
         row["depth_mae"] = depth_mae(image["depth"], true_depth)
     return {k: float(v) for k, v in row.items() if v is not None}

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from bavs_jax.cameras import Cameras, rescale
-from bavs_jax.scenes import checks, images, maps
+from bavs_jax.scenes import checks, folds, images, maps
 from bavs_jax.scenes.base import Scene, SceneError, pixel_table, printable
 from bavs_jax.scenes.extent import scene_extent
 from bavs_jax.scenes.normalise import level_and_scale, transform_poses
@@ -115,7 +115,8 @@ def make_scene(
             for file, (width, height) in zip(capture.files, cameras.sizes)
         ]
     )
-    depth, pixel_mask = depth_table(capture, cameras, unit), mask_table(capture, cameras)
+    names = tuple(checks.view_name(file, capture.root) for file in capture.files)
+    depth, pixel_mask = depth_table(capture, cameras, unit), mask_table(capture, cameras, names)
     images.look_over(capture.files, capture.root, source)
     return Scene(
         name=printable(capture.root.resolve().name),
@@ -128,7 +129,7 @@ def make_scene(
         near=near,
         far=far,
         background=np.asarray(background, np.float32),
-        names=tuple(checks.view_name(file, capture.root) for file in capture.files),
+        names=names,
         depth=depth,
         pixel_mask=pixel_mask,
         unbounded=unbounded,
@@ -137,15 +138,21 @@ def make_scene(
     )
 
 
-def mask_table(capture: Capture, cameras: Cameras) -> np.ndarray | None:
-    """`Scene.pixel_mask` at the sizes of `cameras`, or None where there are no masks."""
+def mask_table(capture: Capture, cameras: Cameras, names: tuple[str, ...]) -> np.ndarray | None:
+    """`Scene.pixel_mask` at the sizes of `cameras`, or None where every pixel counts.
+
+    What a mask leaves out does not count, nor what lies beyond the range of the lens.
+    """
+    shown = folds.shown_masks(cameras, names, capture.source)
     if not capture.masks:
-        return None
+        return None if shown is None else pixel_table(shown)[0]
     table = []
     for view, path in enumerate(capture.masks):
         size = tuple(int(n) for n in capture.cameras.sizes[view])
         mask = maps.read_mask(path, size, capture.files[view])
         mask = maps.shrink_mask(mask, *(int(n) for n in cameras.sizes[view]))
+        if shown is not None:
+            mask &= shown[view]
         if not mask.any():
             width, height = cameras.sizes[view]
             raise SceneError(
