@@ -73,9 +73,9 @@ def _join_others() -> None:
     address = FLAGS.coordinator
     host, _, port = address.rpartition(":")
     try:
-        socket.getaddrinfo(host.strip("[]") or None, int(port))
         is_known = bool(host) and 0 < int(port) < 65536
-    except (ValueError, OSError, UnicodeError):
+        is_known = is_known and bool(socket.getaddrinfo(host.strip("[]"), int(port)))
+    except (ValueError, OSError):
         is_known = False
     if not is_known:
         raise ConfigError(
