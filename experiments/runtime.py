@@ -60,16 +60,15 @@ def given_folder(flag: str, hint: str, *, exists: bool = False) -> pathlib.Path:
     text = flags.FLAGS[flag].value
     if not text:
         raise ConfigError(f"--{flag}: is missing; name {hint}")
-    path = pathlib.Path(text)
+    path, why = pathlib.Path(text), None
     try:
         found = path if exists else next(p for p in (path, *path.parents) if p.exists())
         if not found.is_dir():
-            what = "is no folder" if found.exists() else "does not exist"
-            raise ConfigError(f"--{flag}: {shown(str(found))} {what}; name {hint}")
-    except (OSError, ValueError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"--{flag}: {shown(text)} cannot be used: {error}") from None
+            why = f"{shown(str(found))} " + ("is no folder" if found.exists() else "does not exist")
+    except (OSError, ValueError) as error:  # a name that no file can have
+        why = f"{shown(text)} cannot be used ({error})"
+    if why:
+        raise ConfigError(f"--{flag}: {why}; name {hint}")
     if not os.access(found, os.R_OK | os.X_OK if exists else os.W_OK | os.X_OK):
         raise ConfigError(f"--{flag}: {found}: no permission; name {hint}")
     return path

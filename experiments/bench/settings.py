@@ -42,6 +42,5 @@ def check_sizes(sizes: ConfigDict) -> None:
     schema = {}
     for name, value in leaves(default_sizes()).items():
         one = whole(1, limits.get(name.rpartition(".")[2], 1 << 24))
-        # A line through the times of what grows needs two points.
-        schema[name] = several(one, 2, 16) if isinstance(value, tuple) else one
+        schema[name] = several(one, 1, 16) if isinstance(value, tuple) else one
     check_options(sizes, schema, "sizes")
