@@ -20,8 +20,7 @@ given, st = hypothesis.given, hypothesis.strategies
 ROOT = pathlib.Path(__file__).parents[1]
 CONFIG = ROOT / "experiments" / "configs" / "quickstart.py"
 MAX_GB = 2.0
-NUM_VALUES, NUM_COMMANDS = 1000, 60  # drawn in all, and for each script
-counts = Counter()
+NUM_VALUES, NUM_COMMANDS = 1500, 60  # drawn in all, and for each script
 
 NUMBERS = st.one_of(
     st.integers(-3, 3),
@@ -103,7 +102,6 @@ def check_end(argv, end) -> None:
     assert end["seconds"] < LIMIT_S and end["gb"] < MAX_GB, shown
     if end["code"] == 1:
         assert len(lines) == 1 and lines[0].startswith("error: "), shown
-    counts["refused" if end["code"] == 1 else "taken"] += 1
 
 
 @pytest.mark.slow
