@@ -20,12 +20,9 @@ from bavs_jax.prediction import make_predict_fn
 from bavs_jax.scenes import Scene
 from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
-from bavs_jax.selection.policy import MODES
 from bavs_jax.sources import SourceOptions, make_sources_fn
 from bavs_jax.training.batches import PixelTable, make_pixel_table
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.channel import EXTENTS, SCALES, VARIANTS
-from bavs_jax.uncertainty.curvature import WEIGHTINGS
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, LaplaceOptions, Toolbox
 from bavs_jax.uncertainty.models import MODELS
 from bavs_jax.uncertainty.models.laplace import laplace_variance
@@ -36,7 +33,7 @@ from bavs_jax.uncertainty.true_error import make_true_error_fn
 from experiments.build_field import field_background
 from experiments.build_scene import make_source
 from experiments.build_trainer import KINDS, build_trainer, calls_per_round, train_aside
-from experiments.errors import ConfigError, check_choice
+from experiments.errors import ConfigError
 
 RENDER_CHUNK = 4096  # rays of one compiled rendering call
 
@@ -62,34 +59,13 @@ class Problem(NamedTuple):
     num_devices: int  # that share the rays
 
 
-def check_choices(config) -> None:
-    """Raises ConfigError for an option that is not one of its choices."""
-    for name, kind in (("policies", str), ("seeds", int)):
-        values = config[name]
-        if not isinstance(values, tuple) or not all(isinstance(v, kind) for v in values):
-            raise ConfigError(
-                f"config.{name}: is {values!r}; give a tuple of {kind.__name__}, "
-                f"such as {(kind(1), kind(2))}"
-            )
-    options = config.uncertainty
-    for name, value, known in (
-        ("uncertainty.weighting", options.weighting, WEIGHTINGS),
-        ("uncertainty.variant", options.variant, VARIANTS),
-        ("uncertainty.scale", options.scale, SCALES),
-        ("uncertainty.extent", options.extent, EXTENTS),
-        ("candidates.source", config.candidates.source, ("dataset", "hemisphere")),
-        ("candidates.mode", config.candidates.mode, ("", *MODES)),
-    ):
-        check_choice(name, value, known)
-
-
 def build_problem(
     config, scene: Scene, kind: str = RECONSTRUCTION, mesh: Mesh | None = None
 ) -> Problem:
     """Puts fields, renderer, training, curvature and selection together.
 
     Args:
-      config: see `experiments/configs/base.py`.
+      config: see `experiments/configs/base.py`; `check_config` has seen it.
       scene: the scene.
       kind: of the field that the run trains and is measured on, one of `KINDS`.
       mesh: devices that share the work, from `make_mesh`.
@@ -97,7 +73,6 @@ def build_problem(
     Raises:
       ConfigError: an option that cannot be used.
     """
-    check_choices(config)
     check_shards(config, mesh)
     capacity = 8 * RENDER_CHUNK // num_shards(mesh)
     source, table = make_source(config, scene, make_pixel_table(scene))
@@ -280,13 +255,7 @@ def _laplace_options(config) -> LaplaceOptions:
 
 def _radii(config) -> Radii | None:
     given = (config.candidates.min_train_distance, config.candidates.min_candidate_distance)
-    if given == (0.0, 0.0):
-        return None
-    if 0.0 in given:
-        raise ConfigError(
-            "config.candidates: give both min_train_distance and min_candidate_distance, or neither"
-        )
-    return Radii(*given)
+    return Radii(*given) if any(given) else None
 
 
 def run_key(seed: int) -> jax.Array:

@@ -17,7 +17,7 @@ from bavs_jax.rendering.samplers import Sampler, make_occupancy_sampler
 from bavs_jax.rendering.sampling import make_march_options
 from bavs_jax.rendering.spacing import box_intervals, open_intervals
 from bavs_jax.scenes import Scene
-from experiments.errors import ConfigError, check_choice
+from experiments.errors import ConfigError
 
 # What can sample each kind of field; the first that suits the scene is the default.
 SAMPLERS = {
@@ -40,10 +40,9 @@ def build_field(
       learned_variance: whether the field also learns a variance of its colours.
 
     Raises:
-      ConfigError: an unknown kind, or kinds that do not go together.
+      ConfigError: kinds that do not go together.
     """
     field_kind = config.field_kind
-    check_choice("field_kind", field_kind, SAMPLERS)
     # An occupancy grid ends at the box.
     suitable = [k for k in SAMPLERS[field_kind] if not (scene.unbounded and k == "occupancy")]
     sampler_kind = config.sampler_kind or suitable[0]

@@ -47,7 +47,7 @@ def clean_up() -> None:
     script.check_flags(
         ("max_loss", FLAGS.max_loss >= 0.0, "give 0 dB or more"),
         ("keep", 0.0 < FLAGS.keep <= 1.0, "give a share above 0 and up to 1"),
-        ("num_thresholds", FLAGS.num_thresholds >= 3, "give 3 or more"),
+        ("num_thresholds", 3 <= FLAGS.num_thresholds <= 1000, "give a number from 3 to 1000"),
         ("min_opacity", 0.0 < FLAGS.min_opacity <= 1.0, "give an opacity above 0 and up to 1"),
         ("num_test", FLAGS.num_test >= 0, "give a count, or 0 for all"),
     )

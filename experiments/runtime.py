@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import pathlib
 import sys
@@ -11,8 +12,7 @@ from collections.abc import Callable
 import jax
 from absl import app, flags, logging
 
-# What ml_collections raises for an unknown or ill-typed --config.name flag.
-FLAG_ERRORS = (ValueError, KeyError, FileNotFoundError, AttributeError, TypeError)
+from experiments.errors import ConfigError, one_line, shown
 
 
 def cache_folder() -> pathlib.Path:
@@ -51,10 +51,34 @@ def end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _first_and_last_line(error: Exception) -> str:
-    """An error in one line: of a config file's traceback, where it was read and what went wrong."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return " ".join(dict.fromkeys([lines[0], lines[-1]]))
+def given_folder(flag: str, hint: str, *, exists: bool = False) -> pathlib.Path:
+    """The folder that a flag names, which can be made or, if it `exists` already, read.
+
+    Raises:
+      ConfigError: there is no name, or none of a folder that can be used.
+    """
+    text = flags.FLAGS[flag].value
+    if not text:
+        raise ConfigError(f"--{flag}: is missing; name {hint}")
+    path, why = pathlib.Path(text), None
+    try:
+        found = path if exists else next(p for p in (path, *path.parents) if p.exists())
+        if not found.is_dir():
+            why = f"{shown(str(found))} " + ("is no folder" if found.exists() else "does not exist")
+    except (OSError, ValueError) as error:  # a name that no file can have
+        why = f"{shown(text)} cannot be used ({error})"
+    if why:
+        raise ConfigError(f"--{flag}: {why}; name {hint}")
+    if not os.access(found, os.R_OK | os.X_OK if exists else os.W_OK | os.X_OK):
+        raise ConfigError(f"--{flag}: {found}: no permission; name {hint}")
+    return path
+
+
+def check_finite() -> None:
+    """Raises ConfigError for a flag whose number is not finite, which no bounds of a flag catch."""
+    for name, value in flags.FLAGS.flag_values_dict().items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"--{name}: is {value}; give a finite number")
 
 
 def run_script(main: Callable[[], None]) -> None:
@@ -62,18 +86,27 @@ def run_script(main: Callable[[], None]) -> None:
 
     def parse(argv):
         try:
-            return flags.FLAGS(argv)
+            left = flags.FLAGS(argv)
+            check_finite()
+            return left
         except flags.Error as error:
-            sys.exit(f"error: {_first_and_last_line(error)}; --help explains every flag")
-        except FLAG_ERRORS as error:
-            reason = " ".join(str(error).split())
-            sys.exit(f"error: --config: no such option, or a value of another type: {reason}")
+            sys.exit(f"error: {one_line(error)}; --help explains every flag")
+        except ConfigError as error:
+            sys.exit(f"error: {error}")
+        except Exception as error:  # a config file is a program: it can raise anything
+            sys.exit(
+                "error: --config: no such option or file, or a value of another type: "
+                f"{one_line(error)}"
+            )
 
     def without_arguments(argv):
         if len(argv) > 1:
             sys.exit(f"error: unknown argument {argv[1]!r}; options are given as --name=value")
         # Checkpoint libraries report every write at INFO; warnings and errors still show.
         logging.set_verbosity(logging.WARNING)
-        main()
+        try:
+            main()
+        except ConfigError as error:
+            sys.exit(f"error: {error}")
 
     app.run(without_arguments, flags_parser=parse)

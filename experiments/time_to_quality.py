@@ -28,10 +28,11 @@ from experiments.bench.quality import first_seconds, measure_run, parse_targets
 from experiments.bench.results import QUALITY, quality_tables
 from experiments.build_scene import load_config_scene
 from experiments.configs import base
-from experiments.errors import USER_ERRORS
+from experiments.errors import USER_ERRORS, ConfigError
 from experiments.files import write_json
 from experiments.machine import versions
 from experiments.report.collected import collected_text
+from experiments.schema import given_config
 
 FLAGS = flags.FLAGS
 config_flags.DEFINE_config_file(
@@ -42,9 +43,9 @@ config_flags.DEFINE_config_file(
     lock_config=True,
 )
 flags.DEFINE_string("workdir", None, "Folder for time_to_quality.json and its page.")
-flags.DEFINE_integer("num_views", 20, "Training views.")
-flags.DEFINE_integer("num_test_views", 25, "Test views, evenly spaced.")
-flags.DEFINE_integer("every", 128, "Optimiser steps between two looks at the test views.")
+flags.DEFINE_integer("num_views", 20, "Training views.", 1)
+flags.DEFINE_integer("num_test_views", 25, "Test views, evenly spaced; 0: all.", 0)
+flags.DEFINE_integer("every", 128, "Optimiser steps between two looks at the test views.", 1)
 flags.DEFINE_list("targets", ["25", "28", "30"], "PSNR in dB, the smallest first.")
 PREPARE, CACHES = "prepare", ("cold", "warm")
 flags.DEFINE_enum("part", None, (PREPARE, *CACHES), "Set by the script itself: a part of its work.")
@@ -119,9 +120,9 @@ def compare_caches(config, folder: pathlib.Path, command: str) -> None:
 
 
 def main() -> None:
-    if not FLAGS.workdir:
-        sys.exit("error: --workdir: is missing; name a folder for the results")
-    config, folder = FLAGS.config, pathlib.Path(FLAGS.workdir)
+    config, folder = given_config(), runtime.given_folder("workdir", "a folder for the results")
+    if (FLAGS.part in CACHES) != (FLAGS.started is not None):
+        raise ConfigError("--part and --started: are set by the script itself; leave them out")
     config.lpips_net = ""
     try:
         targets = parse_targets(FLAGS.targets)

@@ -21,6 +21,7 @@ from experiments.configs import base
 from experiments.errors import WorkdirError
 from experiments.progress import track
 from experiments.runner import Run
+from experiments.schema import check_config
 
 FIRST_ROUND = "initial"  # folder of round 0, which all policies of a seed share
 
@@ -96,7 +97,7 @@ def saved_config(workdir: pathlib.Path) -> ConfigDict:
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())
         raise WorkdirError(f"{path}: cannot be read ({reason}): start the run again") from error
-    return config
+    return check_config(config, name=str(path))
 
 
 def find_runs(workdir: pathlib.Path) -> list[tuple[str, int]]:

@@ -94,7 +94,6 @@ def test_every_kind_learns_a_sampler_beside_the_field():
 @pytest.mark.parametrize(
     "unbounded, options, message",
     [
-        (False, {"field_kind": "nerv_mlp"}, "config.field_kind: 'nerv_mlp' is unknown"),
         (True, {"sampler_kind": "occupancy"}, "'occupancy' does not go with"),
         (False, {"sampler_kind": "coarse_to_fine"}, "does not go with field_kind 'hash_grid'"),
         (True, {"field_kind": "mip_mlp"}, "'mip_mlp' is for bounded scenes"),

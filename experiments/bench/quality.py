@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 import jax
@@ -12,7 +13,7 @@ from experiments import runtime
 from experiments.bench.subject import SEED
 from experiments.build import build_problem, run_key
 from experiments.build_scene import initial_views, load_config_scene
-from experiments.errors import ConfigError
+from experiments.errors import ConfigError, shown
 from experiments.evaluate import evaluate_views, spread_evenly
 from experiments.machine import device_name
 from experiments.progress import track
@@ -22,12 +23,15 @@ def parse_targets(texts: list[str]) -> list[str]:
     """PSNRs in dB as they were given, the smallest first.
 
     Raises:
-      ConfigError: one of them is not a number.
+      ConfigError: there is none, or one of them is not a finite number.
     """
     try:
-        return sorted(texts, key=float)
+        numbers = [*map(float, texts)]
     except ValueError:
-        raise ConfigError(f"--targets: {texts} are not all numbers; give some like 25,28") from None
+        numbers = []
+    if not numbers or not all(map(math.isfinite, numbers)):
+        raise ConfigError(f"--targets: {shown(texts)} are not all numbers; give some like 25,28")
+    return sorted(texts, key=float)
 
 
 def measure_run(
