@@ -22,7 +22,7 @@ from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.selection.policy import MODES
 from bavs_jax.sources import SourceOptions, make_sources_fn
-from bavs_jax.training.batches import PixelTable, make_pixel_table
+from bavs_jax.training.batches import PixelTable, make_pixel_table, num_training_pixels
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.channel import EXTENTS, SCALES, VARIANTS
 from bavs_jax.uncertainty.curvature import WEIGHTINGS
@@ -149,16 +149,17 @@ def build_problem(
         return fresh.replace(params=state.params, sampler_state=state.sampler_state)
 
     def make_toolbox(track: Callable) -> Toolbox:
-        def tracked_curvature(state, table, view_ids, within, label, *, weighting, by_view=False):
+        def tracked_curvature(state, rays, label, *, weighting, group_ids=None, **of_rays):
             quiet = contextlib.nullcontext(None)
-            with quiet if label is None else track(len(view_ids), label, "rays") as task:
+            with quiet if label is None else track(len(rays.origins), label, "rays") as task:
                 sums = curvature_fn(weighting)(
-                    *(state.params, state.sampler_state, table, view_ids, within),
+                    *(state.params, state.sampler_state, rays),
                     progress_fn=task and task.advance,
-                    group_ids=view_ids if by_view else None,
+                    group_ids=group_ids,
                     num_groups=group_size,  # in both cases, so that they share compilations
+                    **of_rays,
                 )
-            return sums if by_view else sums[0]
+            return sums[0] if group_ids is None else sums
 
         def train(kind, key, situation):
             return train_aside(config, trainers[kind], key, situation, kind, track)
@@ -217,7 +218,7 @@ def build_problem(
             centre=scene.centre,
             batch_size=config.batch_size,
             calls_per_round=calls_per_round(config),
-            num_rays=int(np.diff(scene.offsets)[np.asarray(initial)].sum()),
+            num_rays=int(num_training_pixels(scene, np.asarray(initial)).sum()),
             radii=_radii(config),
             mode=config.candidates.mode or None,
             label=label,
