@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 
 from bavs_jax import active
 from bavs_jax.devices import num_shards, put_on_all
-from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.fields.deformation import DeformationGrid, offset_unit
 from bavs_jax.metrics.perceptual import make_lpips_fn
 from bavs_jax.prediction import make_predict_fn
 from bavs_jax.scenes import Scene
@@ -106,7 +106,7 @@ def build_problem(
     trainer = trainers[kind]
     field, sampler = trainer.field, trainer.sampler
     background = field_background(scene)
-    laplace, grid = _laplace_options(config), _deformation_grid(config, scene)
+    laplace, grid = _laplace_options(config, scene), _deformation_grid(config, scene)
     group_size = curvature_group_size(grid.num_vertices, len(table.cameras))
 
     @cache
@@ -266,10 +266,11 @@ def _deformation_grid(config, scene: Scene) -> DeformationGrid:
     return DeformationGrid(jnp.asarray(scene.box), cells, contracted=scene.unbounded)
 
 
-def _laplace_options(config) -> LaplaceOptions:
+def _laplace_options(config, scene: Scene) -> LaplaceOptions:
     options = config.uncertainty
+    prior_weight = options.prior_weight or default_prior_weight(options.log2_cells)
     return LaplaceOptions(
-        prior_weight=options.prior_weight or default_prior_weight(options.log2_cells),
+        prior_weight=prior_weight / float(offset_unit(scene.box)) ** 2,
         weighting=options.weighting,
         variant=options.variant,
         scale=options.scale,

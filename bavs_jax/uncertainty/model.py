@@ -55,7 +55,7 @@ class ModelFns(NamedTuple):
 class LaplaceOptions(NamedTuple):
     """The options of the posterior (see `posterior.py` and `channel.py`)."""
 
-    prior_weight: float
+    prior_weight: float  # lambda, 1 / scene unit^2
     weighting: str = "eq13"
     variant: str = "posterior"
     scale: str = "log"
