@@ -14,14 +14,14 @@ from jax.sharding import Mesh
 
 from bavs_jax import active
 from bavs_jax.devices import num_shards, put_on_all
-from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.fields.deformation import DeformationGrid, offset_unit
 from bavs_jax.metrics.perceptual import make_lpips_fn
 from bavs_jax.prediction import make_predict_fn
 from bavs_jax.scenes import Scene
 from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.sources import SourceOptions, make_sources_fn
-from bavs_jax.training.batches import PixelTable, make_pixel_table
+from bavs_jax.training.batches import PixelTable, make_pixel_table, num_training_pixels
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, LaplaceOptions, Toolbox
 from bavs_jax.uncertainty.models import MODELS
@@ -81,7 +81,7 @@ def build_problem(
     trainer = trainers[kind]
     field, sampler = trainer.field, trainer.sampler
     background = field_background(scene)
-    laplace, grid = _laplace_options(config), _deformation_grid(config, scene)
+    laplace, grid = _laplace_options(config, scene), _deformation_grid(config, scene)
     group_size = curvature_group_size(grid.num_vertices, len(table.cameras))
 
     @cache
@@ -124,16 +124,17 @@ def build_problem(
         return fresh.replace(params=state.params, sampler_state=state.sampler_state)
 
     def make_toolbox(track: Callable) -> Toolbox:
-        def tracked_curvature(state, table, view_ids, within, label, *, weighting, by_view=False):
+        def tracked_curvature(state, rays, label, *, weighting, group_ids=None, **of_rays):
             quiet = contextlib.nullcontext(None)
-            with quiet if label is None else track(len(view_ids), label, "rays") as task:
+            with quiet if label is None else track(len(rays.origins), label, "rays") as task:
                 sums = curvature_fn(weighting)(
-                    *(state.params, state.sampler_state, table, view_ids, within),
+                    *(state.params, state.sampler_state, rays),
                     progress_fn=task and task.advance,
-                    group_ids=view_ids if by_view else None,
+                    group_ids=group_ids,
                     num_groups=group_size,  # in both cases, so that they share compilations
+                    **of_rays,
                 )
-            return sums if by_view else sums[0]
+            return sums[0] if group_ids is None else sums
 
         def train(kind, key, situation):
             return train_aside(config, trainers[kind], key, situation, kind, track)
@@ -192,7 +193,7 @@ def build_problem(
             centre=scene.centre,
             batch_size=config.batch_size,
             calls_per_round=calls_per_round(config),
-            num_rays=int(np.diff(scene.offsets)[np.asarray(initial)].sum()),
+            num_rays=int(num_training_pixels(scene, np.asarray(initial)).sum()),
             radii=_radii(config),
             mode=config.candidates.mode or None,
             label=label,
@@ -240,10 +241,11 @@ def _deformation_grid(config, scene: Scene) -> DeformationGrid:
     return DeformationGrid(jnp.asarray(scene.box), cells, contracted=scene.unbounded)
 
 
-def _laplace_options(config) -> LaplaceOptions:
+def _laplace_options(config, scene: Scene) -> LaplaceOptions:
     options = config.uncertainty
+    prior_weight = options.prior_weight or default_prior_weight(options.log2_cells)
     return LaplaceOptions(
-        prior_weight=options.prior_weight or default_prior_weight(options.log2_cells),
+        prior_weight=prior_weight / float(offset_unit(scene.box)) ** 2,
         weighting=options.weighting,
         variant=options.variant,
         scale=options.scale,

@@ -16,6 +16,7 @@ import time
 import numpy as np
 from absl import flags
 
+from bavs_jax.fields.deformation import offset_unit
 from bavs_jax.metrics.covered import MIN_OPACITY
 from bavs_jax.rendering.images import render_views
 from bavs_jax.uncertainty.cleanup import RULES, choose_threshold, spread_thresholds
@@ -65,7 +66,8 @@ def clean_run(run: TrainedRun) -> dict:
     """One run's numbers; writes its pictures."""
     start = time.monotonic()
     variance = run_variance(run, run_curvature(run))
-    thresholds = spread_thresholds(variance, FLAGS.num_thresholds)
+    unit = offset_unit(run.problem.scene.box)
+    thresholds = spread_thresholds(variance, FLAGS.num_thresholds, unit)
     cleaned = make_cleaned_chunk_fn(run, variance)
     test_views = spread_evenly(run.problem.scene.test, FLAGS.num_test)
     sweeps = {

@@ -88,7 +88,7 @@ def export_run(run: TrainedRun) -> dict[str, pathlib.Path]:
     if "grid" in FLAGS.what:
         files |= field_files.write_grid(folder, scene, axes, grid)
         files["slices"] = folder / "slices.png"
-        save_figure(slices_figure(axes, grid), files["slices"])
+        save_figure(slices_figure(axes, grid, scene.box), files["slices"])
     if "points" in FLAGS.what:
         files |= field_files.write_points(
             folder,

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.active import ActiveState, Choice, init_active_state
+from bavs_jax.training.batches import num_training_pixels
 from bavs_jax.training.checkpoints import Checkpoints
 from bavs_jax.uncertainty.model import Situation
 from experiments import acquisitions
@@ -161,7 +162,7 @@ class Run:
 
     def _uncertain_render_fn(self, state: ActiveState):
         """Renders colour and uncertainty (Fig 4) of a state that may come from disk."""
-        num_rays = int(np.diff(self.problem.scene.offsets)[self.initial].sum())
+        num_rays = int(num_training_pixels(self.problem.scene, self.initial).sum())
         fns = self.problem.model_fns("laplace", track)
         situation = Situation(
             *(state.train, state.table, state.is_training_view, num_rays),

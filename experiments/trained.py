@@ -12,6 +12,7 @@ from ml_collections import ConfigDict
 
 from bavs_jax.active import ActiveState
 from bavs_jax.selection.policies import POLICIES, get_policy
+from bavs_jax.training.batches import num_training_pixels
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation, Toolbox
 from bavs_jax.uncertainty.models.laplace import laplace_variance, training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
@@ -160,7 +161,7 @@ def load_run(config, problem: Problem, workdir: pathlib.Path, policy: str, seed:
         config=config,
         problem=problem,
         state=state,
-        num_rays=int(np.diff(problem.scene.offsets)[run.initial].sum()),
+        num_rays=int(num_training_pixels(problem.scene, run.initial).sum()),
         folder=run.folder,
         policy=policy,
         seed=seed,

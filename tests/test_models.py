@@ -118,9 +118,8 @@ def test_candidates_add_what_their_photos_would(trained):
     within = np.arange(rays, dtype=np.int32)
     for index, added in zip((3, 1), curvature(np.array([3, 1]))):
         views = np.full(rays, problem.scene.pool[index], np.int32)
-        jac_sq_sum = toolbox.curvature(
-            situation.train, situation.table, views, within, None, weighting=WEIGHTING
-        )
+        rays = view_pixel_rays(situation.table.cameras, views, within)
+        jac_sq_sum = toolbox.curvature(situation.train, rays, None, weighting=WEIGHTING)
         expected = 2.0 / situation.num_rays * np.asarray(jac_sq_sum)
         assert expected.max() > 0
         # Sums of float32 in another order of rays.

@@ -22,7 +22,7 @@ from bavs_jax.training.losses import colour_loss
 from bavs_jax.training.objectives import make_colour_objective
 from bavs_jax.training.train import init_train_state, make_optimiser, make_train_fn
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
-from bavs_jax.uncertainty.streaming import make_curvature_fn, training_pixels
+from bavs_jax.uncertainty.streaming import make_curvature_fn, table_rays, training_pixels
 from tests.toy_scenes import toy_scene
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -172,6 +172,7 @@ def test_streamed_curvature_equals_one_dense_call_for_any_bucket(trainer):
     )
     grid = DeformationGrid(jnp.asarray(scene.box), 3)
     view_ids, within = training_pixels(table, np.arange(scene.num_views) < 2)
+    pixels = table_rays(table, view_ids, within, "eq13")
     background = jnp.asarray(scene.background)
     rays = view_pixel_rays(table.cameras, jnp.asarray(view_ids), jnp.asarray(within))
 
@@ -189,15 +190,13 @@ def test_streamed_curvature_equals_one_dense_call_for_any_bucket(trainer):
             field, sampler, grid, background=background, buckets=buckets, chunk_samples=chunk
         )
         done = []
-        got = curvature(params, occupancy, table, view_ids, within, progress_fn=done.append)
+        got = curvature(params, occupancy, **pixels, progress_fn=done.append)
         # Another order of the same float32 sums.
         np.testing.assert_allclose(got[0], want, rtol=1e-4, atol=1e-5 * float(want.max()))
         assert sum(done) == len(view_ids)
 
     # A sum for each group of rays.
-    apart = curvature(
-        params, occupancy, table, view_ids, within, group_ids=2 * view_ids, num_groups=3
-    )
+    apart = curvature(params, occupancy, **pixels, group_ids=2 * view_ids, num_groups=3)
     assert got.shape == (1, *want.shape) and apart.shape == (3, *want.shape)
     assert float(apart[0].max()) > 0 and float(apart[2].max()) > 0 and not apart[1].any()
     np.testing.assert_allclose(apart.sum(0), want, rtol=1e-4, atol=1e-5 * float(want.max()))

@@ -150,7 +150,10 @@ def make_hash_grid_field(
     def penalty(params):
         return table_penalty(params["encoding"])
 
-    return Field(init, apply, density, penalty, inputs if appearance_features else no_inputs)
+    has_codes = appearance_features > 0
+    return Field(
+        *(init, apply, density, penalty, inputs if has_codes else no_inputs), reads_views=has_codes
+    )
 
 
 def table_penalty(tables: dict) -> jax.Array:

@@ -17,6 +17,7 @@ from bavs_jax.training.batches import view_pixel_rays
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.models.laplace import laplace_variance
 from bavs_jax.uncertainty.scoring import mean_uncertainty
+from bavs_jax.uncertainty.streaming import table_rays
 from experiments.bench import work
 from experiments.bench.ceilings import Ceilings
 from experiments.bench.clock import timed, timed_runs
@@ -165,9 +166,9 @@ def measure_rendering(subject: Subject, state: TrainState, sizes) -> Stage:
 def make_curvature_run(subject: Subject, state: TrainState, num_rays: int) -> Callable:
     """Makes `run() -> jac_sq_sum` of so many training pixels."""
     toolbox, table = subject.toolbox, subject.problem.table
-    view_ids, within = draw_training_pixels(subject, num_rays)
+    pixels, weighting = draw_training_pixels(subject, num_rays), toolbox.laplace.weighting
     return lambda: toolbox.curvature(
-        *(state, table, view_ids, within, None), weighting=toolbox.laplace.weighting
+        state, label=None, weighting=weighting, **table_rays(table, *pixels, weighting)
     )
 
 

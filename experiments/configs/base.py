@@ -122,10 +122,10 @@ def get_config() -> ConfigDict:
     # --- uncertainty (bavs_jax/uncertainty) ---
     config.uncertainty = ConfigDict()
     config.uncertainty.log2_cells = 6  # L: a grid of 2^L cells per side
-    config.uncertainty.prior_weight = 0.0  # lambda; 0: 1e-4 / (2^L)^3
+    config.uncertainty.prior_weight = 0.0  # lambda, of thirds of the box; 0: 1e-4 / (2^L)^3
     config.uncertainty.weighting = "eq13"  # "eq13", "eq11" or "empirical"
     config.uncertainty.variant = "posterior"  # "posterior" or "bayesrays"
-    config.uncertainty.scale = "log"  # "log": log10 sigma on [0, 1]; "sigma"
+    config.uncertainty.scale = "log"  # "log": log10(sigma / third of the box) on [0, 1]; "sigma"
     config.uncertainty.extent = "box"  # what counts: the scene "box", or all "space" around it too
     config.uncertainty.offset_cells = 0.3  # of "laplace_predictive": offsets a priori, in cells
     config.uncertainty.flow_draws = 16  # of "cf_nerf" when rendering; 32 in its paper

@@ -16,6 +16,7 @@ from bavs_jax.export.grid import sample_grid
 from bavs_jax.export.mesh import extract_mesh, without_small_parts
 from bavs_jax.export.ply import ply_bytes
 from bavs_jax.export.volume import nrrd_bytes
+from bavs_jax.fields.deformation import offset_unit
 from bavs_jax.scenes import Scene
 from bavs_jax.scenes.poses import user_points, user_units
 from bavs_jax.scenes.sdf_surface import sample_surface
@@ -33,13 +34,13 @@ SHELL_SHARE, SURFACE_TOLERANCE = 5e-3, 5e-5
 VOLUMES = {  # name of the file: what it holds, and its unit in the user's coordinates
     "density": "density, 1 / user unit",
     "sigma": "standard deviation of the offset, user units",
-    "uncertainty": "log10 of sigma in scene units, [-3, 6] put on [0, 1]",
+    "uncertainty": "log10 of sigma in thirds of the box's mean side, [-3, 6] put on [0, 1]",
 }
 
 
-def on_unit_scale(sigma) -> np.ndarray:
+def on_unit_scale(sigma, box) -> np.ndarray:
     """Standard deviations in scene units as renderings show them: their log on [0, 1]."""
-    return np.asarray(finish_uncertainty(np.log10(sigma), scale="log"))
+    return np.asarray(finish_uncertainty(np.log10(sigma / offset_unit(box)), scale="log"))
 
 
 def in_user_units(scene: Scene, values: dict) -> dict:
@@ -48,7 +49,7 @@ def in_user_units(scene: Scene, values: dict) -> dict:
     return {
         "density": values["density"] / unit,
         "sigma": values["sigma"] * unit,
-        "uncertainty": on_unit_scale(values["sigma"]),
+        "uncertainty": on_unit_scale(values["sigma"], scene.box),
     }
 
 

@@ -23,6 +23,7 @@ from bavs_jax.selection.information import (
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.selection.worth import Worth, worth_along
 from bavs_jax.sources import make_candidate_curvature_fn
+from bavs_jax.training.batches import num_training_pixels
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
 from bavs_jax.uncertainty.posterior import posterior_precision
@@ -70,8 +71,8 @@ def make_score_fn(problem: Problem, train: TrainState, cameras: Cameras, scale: 
 
 
 def photo_rays(problem: Problem) -> int:
-    """R of Eq 13: the rays of all training photos."""
-    return int(np.diff(problem.scene.offsets)[problem.scene.pool].sum())
+    """R of Eq 13: the rays of all training photos that are not masked."""
+    return int(num_training_pixels(problem.scene, problem.scene.pool).sum())
 
 
 def photo_situation(problem: Problem, train: TrainState, cameras: Cameras) -> Situation:
