@@ -287,8 +287,3 @@ def _radii(config) -> Radii | None:
             "config.candidates: give both min_train_distance and min_candidate_distance, or neither"
         )
     return Radii(*given)
-
-
-def run_key(seed: int) -> jax.Array:
-    """The key from which all of a run's randomness comes."""
-    return jax.random.key(seed)

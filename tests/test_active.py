@@ -19,7 +19,6 @@ from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 from tests.traces import count_traces
 
-
 # What each kind of source compiles once: no shape in it changes while views grow.
 FIXED_SHAPES = {
     "random": {"train", "top_k", "farthest_ranks", "nearest_distances"},

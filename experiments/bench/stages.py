@@ -28,8 +28,9 @@ from experiments.bench.subject import (
     draw_training_pixels,
     pixel_centres,
 )
-from experiments.build import RENDER_CHUNK, run_key
+from experiments.build import RENDER_CHUNK
 from experiments.build_trainer import Trainer
+from experiments.keys import run_key, stream_key
 from experiments.machine import peak_device_memory_mb, peak_memory_mb
 
 
@@ -87,7 +88,7 @@ def _measure(name: str, unit: str, amount: float, run: Callable, repeats: int, w
 
 def training_compile_seconds(subject: Subject) -> float:
     """What the first compiled call takes longer than the second."""
-    state = subject.trainer.init(run_key(SEED))
+    state = subject.trainer.init(stream_key(SEED, "init"))
     run = make_training_run(subject, subject.trainer, state, 1)
     first, second = timed(run)[0], timed(run)[0]
     return first - second

@@ -30,8 +30,9 @@ from bavs_jax.uncertainty.channel import make_uncertainty_channel
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 from bavs_jax.uncertainty.model import RECONSTRUCTION
 from experiments.bench.counts import Work, compiled_work
-from experiments.bench.subject import Subject, changed
+from experiments.bench.subject import SEED, Subject, changed
 from experiments.build_trainer import build_trainer
+from experiments.keys import run_key
 
 CHUNK_SAMPLES = 8192  # slots of the piece of curvature
 MIN_WIDTH = 8
@@ -42,7 +43,7 @@ def training_work(subject: Subject, state: TrainState) -> Work:
     config, problem = subject.config, subject.problem
     short = changed(config, train__steps_per_call=1)
     trainer = build_trainer(short, subject.scene, len(problem.table.cameras), RECONSTRUCTION)
-    key = jax.random.key(0)
+    key = run_key(SEED)
     call = compiled_work(trainer.call, key, state, problem.table, subject.is_training_view)
 
     def update(key, state):
