@@ -258,8 +258,3 @@ def _laplace_options(config, scene: Scene) -> LaplaceOptions:
 def _radii(config) -> Radii | None:
     given = (config.candidates.min_train_distance, config.candidates.min_candidate_distance)
     return Radii(*given) if any(given) else None
-
-
-def run_key(seed: int) -> jax.Array:
-    """The key from which all of a run's randomness comes."""
-    return jax.random.key(seed)

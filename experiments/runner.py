@@ -18,10 +18,11 @@ from bavs_jax.training.checkpoints import Checkpoints
 from bavs_jax.uncertainty.model import Situation
 from experiments import acquisitions
 from experiments.baselines import measure_baselines
-from experiments.build import Problem, run_key
+from experiments.build import Problem
 from experiments.build_scene import initial_views
 from experiments.evaluate import measure_test_views, picture_arrays, spread_evenly
 from experiments.files import append_line, write_arrays, write_json
+from experiments.keys import run_key, stream_key
 from experiments.machine import device_name, peak_memory_mb, versions
 from experiments.parts import Part
 from experiments.predicted.cases import realised_gain
@@ -168,14 +169,14 @@ class Run:
             *(state.train, state.table, state.is_training_view, num_rays),
             label=f"{self.label}: pictures",
         )
-        fitted = fns.fit(jax.random.fold_in(run_key(self.seed), 2**31 - 2), situation)
+        fitted = fns.fit(stream_key(self.seed, "pictures"), situation)
         return partial(fns.render, fitted, state.train)
 
     # --- files ---
 
     def _start(self, shared: Run | None) -> ActiveState:
         """The last checkpoint's state, or the one where `shared` ended, or a fresh one."""
-        init_key = jax.random.fold_in(run_key(self.seed), 2**31 - 1)
+        init_key = stream_key(self.seed, "init")
         fresh = init_active_state(
             self.problem.init_train(init_key), self.problem.table, self.initial
         )

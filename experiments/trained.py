@@ -16,10 +16,11 @@ from bavs_jax.training.batches import num_training_pixels
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation, Toolbox
 from bavs_jax.uncertainty.models.laplace import laplace_variance, training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
-from experiments.build import Problem, run_key
+from experiments.build import Problem
 from experiments.build_trainer import KINDS
 from experiments.configs import base
 from experiments.errors import WorkdirError
+from experiments.keys import stream_key
 from experiments.progress import track
 from experiments.runner import Run
 from experiments.schema import check_config
@@ -192,7 +193,7 @@ def train_run(
 def run_curvature(run: TrainedRun) -> jax.Array:
     """`jac_sq_sum` [G, 3] of the training rays, with progress."""
     # The key of the run's own pictures, so that the same uncertainty comes out.
-    key = jax.random.fold_in(run_key(run.seed), 2**31 - 2)
+    key = stream_key(run.seed, "pictures")
     toolbox = run.toolbox
     return training_curvature(key, toolbox, run.situation, toolbox.laplace.weighting)
 

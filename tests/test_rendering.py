@@ -10,7 +10,12 @@ import pytest
 from bavs_jax.cameras import Rays
 from bavs_jax.rendering.compositing import composite, expected_depth, render_weights
 from bavs_jax.rendering.hits import nth_hit, pack_hits
-from bavs_jax.rendering.occupancy import cell_index, init_occupancy, update_occupancy
+from bavs_jax.rendering.occupancy import (
+    WARMUP_UPDATES,
+    cell_index,
+    init_occupancy,
+    update_occupancy,
+)
 from bavs_jax.rendering.packing import evaluate_all_passes, evaluate_one_pass
 from bavs_jax.rendering.render import Channel, render_rays
 from bavs_jax.rendering.sampling import make_march_options, march
@@ -48,6 +53,14 @@ def test_homogeneous_fog_has_its_closed_form():
     for num in (1, 7, 100):
         weights = render_weights(jnp.full(num, 0.7), jnp.full(num, 2.0 / num))
         np.testing.assert_allclose(weights.sum(), 1.0 - np.exp(-1.4), rtol=1e-5)
+
+
+def test_small_opacities_are_exact():
+    # 1 - exp(-x) would be 0 below x = 6e-8, and of one digit at 1e-7.
+    optical = np.array([1e-10, 1e-7, 1e-4], np.float32)
+    for x in optical:
+        weights = render_weights(jnp.array([x]), jnp.ones(1))
+        np.testing.assert_allclose(weights, -np.expm1(-np.float64(x)), rtol=1e-6)
 
 
 @pytest.mark.parametrize("density", [0.0, 1e-12, 1e5])
@@ -148,6 +161,33 @@ def test_occupancy_finds_a_ball_and_forgets_what_is_gone():
     for i in range(60):
         occupancy = update(jax.random.key(100 + i), occupancy, nothing)
     assert not occupancy.occupied[cell_index(occupancy, inside)].any()
+
+
+@pytest.mark.parametrize("num_updates", [WARMUP_UPDATES - 1, WARMUP_UPDATES])
+@pytest.mark.parametrize("scale", [1.0, 1e-3])
+def test_an_update_agrees_with_a_loop_over_the_samples(scale, num_updates):
+    """`scale` 1 is above the threshold on average, 1e-3 is below; some cells are drawn twice."""
+    before = scale * jax.random.exponential(jax.random.key(0), (27,))
+    occupancy = init_occupancy(BOX, resolution=3).replace(
+        density=before, num_updates=jnp.int32(num_updates)
+    )
+    seen = []
+
+    def density_fn(x):
+        seen.append((x, scale * (x[:, 0] + 1.5) ** 4))
+        return seen[0][1]
+
+    options = {"num_samples": 15, "step_size": 0.1, "decay": 0.5, "threshold": 0.05}
+    after = update_occupancy(jax.random.key(1), occupancy, density_fn, **options)
+    want, cells = np.array(before), np.asarray(cell_index(occupancy, seen[0][0]))
+    assert 5 < len(set(cells)) < 15
+    for cell in set(cells):
+        want[cell] = max(0.5 * want[cell], *np.asarray(seen[0][1])[cells == cell])
+    np.testing.assert_allclose(after.density, want, rtol=1e-6)
+    is_thick = 0.1 * want > min(0.05, 0.1 * want.mean())
+    assert 0 < is_thick.sum() < 27
+    np.testing.assert_array_equal(after.occupied, is_thick | (num_updates < WARMUP_UPDATES))
+    assert after.num_updates == num_updates + 1
 
 
 def test_fresh_occupancy_keeps_everything_at_first():

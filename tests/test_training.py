@@ -5,6 +5,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from bavs_jax.fields.deformation import DeformationGrid
@@ -91,7 +92,7 @@ def test_sampled_pixels_come_from_training_views_alone_and_from_all_of_them(trai
     mask = np.zeros(scene.num_views, bool)
     mask[[1, 4, 7]] = True
     batch = sample_pixels(jax.random.key(0), table, jnp.asarray(mask), 3000)
-    rays, rgb = batch.rays, batch.rgb
+    rays = batch.rays
     positions = np.asarray(scene.cameras.positions)
     owner = np.linalg.norm(rays.origins[:, None] - positions, axis=-1).argmin(1)
     counts = np.bincount(owner, minlength=scene.num_views)
@@ -99,7 +100,28 @@ def test_sampled_pixels_come_from_training_views_alone_and_from_all_of_them(trai
     np.testing.assert_array_equal(owner, batch.view_ids)
     # Binomial with p = 1/3: standard deviation 26; four of them.
     np.testing.assert_allclose(counts[[1, 4, 7]], 1000, atol=104)
-    assert rgb.min() >= 0 and rgb.max() <= 1
+
+
+def test_a_sampled_pixel_has_its_own_ray_colour_and_weight():
+    scene = toy_scene()
+    table = make_pixel_table(scene)
+    num, rng = len(scene.pixels), np.random.default_rng(0)
+    rgb = rng.permutation(256**3)[:num, None] // np.array([1, 256, 65536]) % 256  # no two alike
+    keep = rng.uniform(size=num) < 0.7
+    table = table.replace(pixels=jnp.asarray(rgb, jnp.uint8), pixel_mask=jnp.asarray(keep))
+    is_training = np.isin(np.arange(scene.num_views), [0, 4, 7])
+    batch = sample_pixels(jax.random.key(0), table, jnp.asarray(is_training), 3000)
+    packed = np.round(np.asarray(batch.rgb, np.float64) * 255).astype(int) @ [1, 256, 65536]
+    row_of = {int(c): row for row, c in enumerate(rgb @ [1, 256, 65536])}
+    rows = np.array([row_of[int(c)] for c in packed])
+    # 192 pixels, each drawn 16 times on average; that one of them is left out has 3e-5.
+    view_of = np.searchsorted(scene.offsets, np.arange(num), side="right") - 1
+    np.testing.assert_array_equal(np.unique(rows), np.flatnonzero(is_training[view_of]))
+    np.testing.assert_array_equal(batch.view_ids, view_of[rows])
+    np.testing.assert_array_equal(batch.ray_weight, keep[rows])
+    rays = view_pixel_rays(table.cameras, view_of[rows], rows - scene.offsets[view_of[rows]])
+    np.testing.assert_allclose(batch.rays.origins, rays.origins, atol=1e-6)
+    np.testing.assert_allclose(batch.rays.directions, rays.directions, atol=1e-6)
 
 
 def test_rays_and_colours_belong_together(trainer):
@@ -147,6 +169,33 @@ def test_training_learns_and_compiles_once_while_views_are_added(trainer):
     assert np.mean(losses[-5:]) < 0.2 * losses[0]
     assert train._cache_size() == traces == 1
     assert int(state.step) == 120
+
+
+def test_the_penalty_pulls_at_the_field_by_its_weight(trainer):
+    scene, field, sampler, *_ = trainer
+    table, mask = make_pixel_table(scene), jnp.ones(scene.num_views, bool)
+    objective = make_colour_objective(field, background=scene.background, capacity=1024)
+    tables = {}
+    for weight in (0.0, 3.0):
+        train = make_train_fn(
+            *(field, sampler, objective, optax.sgd(0.5), lambda step: 0.5),
+            num_rays=64,
+            penalty_weight=weight,
+            steps_per_call=1,
+        )
+        start = init_train_state(jax.random.key(0), field, sampler, optax.sgd(0.5))
+        before = jax.tree.map(lambda x: 1e3 * x, start.params["field"]["encoding"])
+        start = start.replace(
+            params=start.params | {"field": start.params["field"] | {"encoding": before}}
+        )
+        before = jax.tree.map(np.asarray, before)
+        after, _ = train(jax.random.key(1), start, table, mask)
+        tables[weight] = jax.tree.map(np.asarray, after.params["field"]["encoding"])
+    for name, entries in before.items():
+        # 0.5 times the slope of 3 mean(entries^2)
+        expected = -0.5 * 3.0 * 2.0 * entries / entries.size
+        assert np.abs(expected).max() > 1e-5
+        np.testing.assert_allclose(tables[3.0][name] - tables[0.0][name], expected, atol=1e-7)
 
 
 def test_training_is_deterministic(trainer):

@@ -11,10 +11,11 @@ import numpy as np
 from bavs_jax.active import init_active_state
 from experiments import runtime
 from experiments.bench.subject import SEED
-from experiments.build import build_problem, run_key
+from experiments.build import build_problem
 from experiments.build_scene import initial_views, load_config_scene
 from experiments.errors import ConfigError, shown
 from experiments.evaluate import evaluate_views, spread_evenly
+from experiments.keys import run_key, stream_key
 from experiments.machine import device_name
 from experiments.progress import track
 
@@ -76,7 +77,7 @@ def measure_run(
                 paused += time.time() - stopped
             bar.advance(steps, psnr=curve[-1]["psnr"] if curve else np.nan)
 
-        fresh = problem.init_train(jax.random.fold_in(key, 2**31 - 1))
+        fresh = problem.init_train(stream_key(SEED, "init"))
         step(key, init_active_state(fresh, problem.table, initial), None, on_call)
     return {
         "curve": curve,

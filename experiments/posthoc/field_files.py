@@ -6,7 +6,6 @@ import pathlib
 from collections.abc import Callable
 from functools import partial
 
-import jax
 import numpy as np
 
 from bavs_jax.export.cloud import ray_end_points
@@ -22,8 +21,9 @@ from bavs_jax.scenes.poses import user_points, user_units
 from bavs_jax.scenes.sdf_surface import sample_surface
 from bavs_jax.uncertainty.channel import finish_uncertainty
 from bavs_jax.uncertainty.streaming import training_pixels
-from experiments.build import RENDER_CHUNK, run_key
+from experiments.build import RENDER_CHUNK
 from experiments.files import write_arrays, write_atomic
+from experiments.keys import stream_key
 from experiments.progress import track
 from experiments.trained import TrainedRun
 
@@ -157,7 +157,7 @@ def measure_geometry(run: TrainedRun, mesh, signed_distance: Callable, *, num: i
     side = float(np.max(scene.box[1] - scene.box[0]))
     print(f"geometry: draws {num} points on each surface")
     true = sample_surface(
-        jax.random.fold_in(run_key(run.seed), 2**31 - 4),
+        stream_key(run.seed, "surface"),
         signed_distance,
         scene.box,
         2 * num,

@@ -30,6 +30,7 @@ from bavs_jax.uncertainty.posterior import posterior_precision
 from bavs_jax.uncertainty.scoring import mean_uncertainty, reduced_cameras
 from experiments.build import RENDER_CHUNK, Problem
 from experiments.evaluate import spread_evenly
+from experiments.keys import stream_key
 from experiments.progress import track
 
 NUM_AT_ONCE = 8  # candidates between two steps of the progress bar
@@ -156,7 +157,7 @@ def suggest(
     gains = information_gains(information, len(cameras), "what candidates would tell")
 
     chooser = get_policy(policy)
-    source_key, choose_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
+    source_key, choose_key = jax.random.split(stream_key(seed, "choice"))
     situation = photo_situation(problem, train, cameras)
     fields = {"mean_uncertainty_fn": lambda rows, picked: scores[rows], "information": information}
     if chooser.uncertainty != "laplace" or not chooser.needs <= fields.keys():

@@ -17,6 +17,7 @@ from bavs_jax.placement.seen import in_unknown_space
 from bavs_jax.scenes import Scene
 from bavs_jax.scenes.normalise import transform_poses
 from bavs_jax.scenes.pose_files import read_pose_file
+from experiments.keys import stream_key
 from experiments.suggest.settings import Options
 
 CLEARANCE_SHARE = 0.05  # of the median distance of the photos from what they look at
@@ -161,7 +162,7 @@ def _make_draw_fn(scene: Scene, around: Surroundings, options: Options) -> Calla
         return aim(positions, turned_targets(rng, positions, targets, options.gaze_jitter), up)
 
     def hemisphere(rng, lap):
-        key = jax.random.fold_in(jax.random.key(options.seed), lap)
+        key = jax.random.fold_in(stream_key(options.seed, "places"), lap)
         return hemisphere_poses(key, num, centre=around.focus, radius=around.distance, up=up)
 
     def box(rng, lap):

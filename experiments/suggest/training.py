@@ -6,7 +6,6 @@ import dataclasses
 import pathlib
 import time
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,9 +15,10 @@ from bavs_jax.training.checkpoints import Checkpoints
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import Situation
 from bavs_jax.uncertainty.models.laplace import training_curvature
-from experiments.build import Problem, run_key
+from experiments.build import Problem
 from experiments.evaluate import evaluate_views, spread_evenly
 from experiments.files import write_arrays
+from experiments.keys import run_key, stream_key
 from experiments.progress import track
 
 
@@ -43,7 +43,7 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
     """
     pool, steps = problem.scene.pool, config.train.steps_per_call
     checkpoints = Checkpoints(folder / "checkpoints", keep=1)
-    init_key = jax.random.fold_in(run_key(seed), 2**31 - 1)
+    init_key = stream_key(seed, "init")
     state = init_active_state(problem.init_train(init_key), problem.table, pool)
     if checkpoints.latest() is not None:
         saved, meta = checkpoints.restore(state.train)
@@ -80,7 +80,7 @@ def photo_curvature(problem: Problem, train: TrainState, folder: pathlib.Path, s
     toolbox = problem.make_toolbox(track)
     situation = Situation(train, problem.table, is_training, num_rays=0, label="photos")
     jac_sq_sum = training_curvature(
-        run_key(seed), toolbox, situation, weighting=toolbox.laplace.weighting
+        stream_key(seed, "photos"), toolbox, situation, weighting=toolbox.laplace.weighting
     )
     write_arrays(path, jac_sq_sum=np.asarray(jac_sq_sum))
     return jac_sq_sum

@@ -10,13 +10,13 @@ import json
 import pathlib
 from functools import partial
 
-import jax
 import numpy as np
 
 from bavs_jax.rendering.images import render_views
-from experiments.build import RENDER_CHUNK, Problem, run_key
+from experiments.build import RENDER_CHUNK, Problem
 from experiments.evaluate import mean_quality, spread_evenly
 from experiments.files import write_arrays, write_json
+from experiments.keys import stream_key
 from experiments.machine import code_commit
 from experiments.trained import FIRST_ROUND, train_run
 from experiments.uncertain import intervals, measure
@@ -46,7 +46,7 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
     scene, options = problem.scene, config.evaluation
     situation = trained_situation(config, problem, folder, seed, command)
     view_ids = spread_evenly(scene.test, options.num_views)
-    key = jax.random.fold_in(run_key(seed), 2**31 - 3)
+    key = stream_key(seed, "evaluation")
     common = _common_images(problem, folder, seed, key, situation, view_ids)
     errors_of = partial(measure.pixel_errors, scene, view_ids, scale_depth=options.scale_depth)
     about_common = errors_of(common.images), mean_quality(scene, view_ids, common.images)
