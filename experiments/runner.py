@@ -27,6 +27,7 @@ from experiments.predicted.cases import realised_gain
 from experiments.processes import as_first_process, is_first_process
 from experiments.progress import track
 from experiments.report.choices import bound_words
+from experiments.runtime import warn
 
 SCHEMA_VERSION = 1
 LOG_EVERY = 10  # training calls between two lines of metrics.jsonl
@@ -48,7 +49,7 @@ class Run:
         self.initial = initial_views(problem.scene, seed, config.num_initial)
         self.rounds: list[dict] = []  # of result.json
         self.pending = _new_pending()  # what is known of the round under way
-        self.checkpoints = Checkpoints(self.folder / "checkpoints")
+        self.checkpoints = Checkpoints(self.folder / "checkpoints", warn_fn=warn)
 
     def finish(self, shared: Run | None = None) -> None:
         """Goes on from the last checkpoint to the last round and writes all files of the run.
@@ -179,8 +180,9 @@ class Run:
             self.problem.init_train(init_key), self.problem.table, self.initial
         )
         for run in (self, shared):
-            if run is not None and run.checkpoints.latest() is not None:
-                saved, meta = run.checkpoints.restore(saved_part(self.problem, fresh))
+            found = run and run.checkpoints.restore(saved_part(self.problem, fresh))
+            if found:
+                saved, meta = found
                 self.rounds, self.pending = meta["rounds"], meta["pending"]
                 return whole_state(self.problem, saved)
         return fresh

@@ -11,6 +11,9 @@ from collections.abc import Callable
 import jax
 from absl import app, flags, logging
 
+from experiments import signals
+from experiments.errors import USER_ERRORS
+
 # What ml_collections raises for an unknown or ill-typed --config.name flag.
 FLAG_ERRORS = (ValueError, KeyError, FileNotFoundError, AttributeError, TypeError)
 
@@ -27,6 +30,11 @@ def use_compilation_cache(folder: pathlib.Path | None) -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def warn(text: str) -> None:
+    """A line on standard error, for what goes on all the same."""
+    print(f"warning: {text}", file=sys.stderr, flush=True)
 
 
 def command_line() -> str:
@@ -58,7 +66,10 @@ def _first_and_last_line(error: Exception) -> str:
 
 
 def run_script(main: Callable[[], None]) -> None:
-    """Runs a script's `main()` after reading its flags; wrong ones end in one line."""
+    """Runs a script's `main()` after reading its flags; what goes wrong ends in one line.
+
+    So do ctrl-C and SIGTERM, with the exit codes that shells give for them.
+    """
 
     def parse(argv):
         try:
@@ -74,6 +85,15 @@ def run_script(main: Callable[[], None]) -> None:
             sys.exit(f"error: unknown argument {argv[1]!r}; options are given as --name=value")
         # Checkpoint libraries report every write at INFO; warnings and errors still show.
         logging.set_verbosity(logging.WARNING)
-        main()
+        signals.interrupt_work()
+        try:
+            main()
+        except BaseException as error:
+            # Libraries may make another error of the interrupt.
+            if number := signals.received():
+                signals.end(number)
+            if isinstance(error, (*USER_ERRORS, OSError)):
+                sys.exit(f"error: {' '.join(str(error).split())}")
+            raise
 
     app.run(without_arguments, flags_parser=parse)

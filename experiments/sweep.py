@@ -12,7 +12,6 @@ ablations do. Started again, a sweep goes on: what is finished is not run again.
 from __future__ import annotations
 
 import pathlib
-import signal
 import sys
 
 from absl import flags
@@ -125,14 +124,10 @@ def main() -> None:
     flag = FLAGS["config"]
     given = [f"--config={config_flags.get_config_filename(flag)}"]
     given += [option_flag(*item) for item in config_flags.get_override_values(flag).items()]
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         failed = sweep(FLAGS.config, pathlib.Path(FLAGS.workdir), given)
     except (*USER_ERRORS, ReportError, OSError) as error:
         sys.exit(f"error: {' '.join(str(error).split())}")
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        sys.exit(128 + signal.SIGINT)
     if failed:
         sys.exit(f"error: {failed} trial{'s' if failed > 1 else ''} failed; reasons are above")
 

@@ -56,12 +56,14 @@ SCHEMA_VERSION = 1
 def start_process(folder: pathlib.Path, part: str) -> dict | None:
     """One part in a process of its own; what it wrote, if anything.
 
-    This process never touches the device, which a second one might not be able to share.
+    This process never touches the device, which a second one might not be able to share. Ctrl-C
+    reaches this one only, which ends the other.
     """
     command = [sys.executable, "-m", "experiments.time_to_quality", *sys.argv[1:]]
     path = folder / f"{part}.json"
     path.unlink(missing_ok=True)
-    done = subprocess.run([*command, f"--part={part}", f"--started={time.time()!r}"], check=False)
+    command += [f"--part={part}", f"--started={time.time()!r}"]
+    done = subprocess.run(command, check=False, start_new_session=True)
     if done.returncode:
         sys.exit(done.returncode)
     if not path.exists():

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.errors import ReportError
 from experiments.versioned import read_versioned
 
 SCHEMA_VERSION = 1
@@ -17,10 +18,6 @@ ACQUISITION_KEYS = (
     *("scores", "survivors", "selected", "initial"),
 )
 RUN_KEYS = ("scene", "policy", "seed", "rounds", "completed")
-
-
-class ReportError(ValueError):
-    """A file that cannot be used: one line that names the file, the field and the fix."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,6 +20,7 @@ from experiments.build import Problem, run_key
 from experiments.evaluate import evaluate_views, spread_evenly
 from experiments.files import write_arrays
 from experiments.progress import track
+from experiments.runtime import warn
 
 
 def all_for_training(scene: Scene, holdout: int) -> Scene:
@@ -42,11 +43,12 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
       FloatingPointError: the loss is not finite.
     """
     pool, steps = problem.scene.pool, config.train.steps_per_call
-    checkpoints = Checkpoints(folder / "checkpoints", keep=1)
+    checkpoints = Checkpoints(folder / "checkpoints", warn_fn=warn)
     init_key = jax.random.fold_in(run_key(seed), 2**31 - 1)
     state = init_active_state(problem.init_train(init_key), problem.table, pool)
-    if checkpoints.latest() is not None:
-        saved, meta = checkpoints.restore(state.train)
+    found = checkpoints.restore(state.train)
+    if found is not None:
+        saved, meta = found
         state = state.replace(train=saved, calls=jnp.int32(meta["calls"]))
     left = problem.calls_per_round - int(state.calls)
     if left > 0:
