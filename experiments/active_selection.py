@@ -20,7 +20,7 @@ from ml_collections import config_flags
 from bavs_jax.selection.policies import POLICIES
 from experiments import compilation, job, runtime, workdir
 from experiments.build import build_problem
-from experiments.build_scene import load_config_scene
+from experiments.build_scene import initial_views, load_config_scene
 from experiments.errors import USER_ERRORS
 from experiments.files import exclusive
 from experiments.parts import all_parts, find_part
@@ -53,11 +53,12 @@ def make_parts(
     parts = all_parts(config.policies, config.seeds)
     if only is not None:
         parts = [find_part(only, parts)]
-    folder.mkdir(parents=True, exist_ok=True)
-    workdir.claim(folder, config)
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    workdir.check_claim(folder, config)
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     print(f"{scene.name}: {len(scene.pool)} views to choose from, {len(scene.test)} test views")
     problems = {kind: build_problem(config, scene, kind, mesh) for kind in {p.kind for p in parts}}
+    initial_views(scene, parts[0].seed, config.num_initial)  # whether there are so many
+    workdir.claim(folder, config)
 
     def make(part, shared=None) -> Run:
         # Other processes may make other parts of the same folder, and need the same round 0.

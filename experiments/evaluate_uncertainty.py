@@ -23,7 +23,7 @@ from bavs_jax.uncertainty.conformal_scale import SCALES
 from bavs_jax.uncertainty.models import MODELS
 from experiments import compilation, runtime, workdir
 from experiments.build import build_problem
-from experiments.build_scene import load_config_scene
+from experiments.build_scene import initial_views, load_config_scene
 from experiments.errors import USER_ERRORS, check_choice
 from experiments.uncertain.one_seed import measure_seed
 from experiments.uncertain.summary import write_summary
@@ -46,10 +46,11 @@ def evaluate(config, folder: pathlib.Path, command: str) -> None:
         check_choice("evaluation.models", name, tuple(MODELS))
     check_choice("evaluation.interval_scale", config.evaluation.interval_scale, SCALES)
     start = time.monotonic()
-    folder.mkdir(parents=True, exist_ok=True)
-    workdir.claim(folder, config)
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    workdir.check_claim(folder, config)
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     problem = build_problem(config, scene)
+    initial_views(scene, config.seeds[0], config.num_initial)  # whether there are so many
+    workdir.claim(folder, config)
     for seed in config.seeds:
         measure_seed(config, problem, folder, seed, command)
     numbers, page = write_summary(config, scene, folder, command)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import pathlib
 import sys
+import tempfile
 import threading
 from collections.abc import Callable
 
@@ -18,22 +20,46 @@ from experiments.errors import USER_ERRORS
 FLAG_ERRORS = (ValueError, KeyError, FileNotFoundError, AttributeError, TypeError)
 
 
-def cache_folder() -> pathlib.Path:
-    """Where scenes and compiled programs are kept: `$XDG_CACHE_HOME` or `~/.cache`."""
-    root = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-    return pathlib.Path(root) / "bavs_jax"
+def cache_folder() -> pathlib.Path | None:
+    """Where scenes and compiled programs are kept: in `$XDG_CACHE_HOME` or `~/.cache`.
+
+    None, after a warning, where nothing can be.
+    """
+    root = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    try:
+        return usable_cache(pathlib.Path(root).expanduser() / "bavs_jax")
+    except RuntimeError as error:  # nobody's home
+        warn(f"{root}: {error}: goes on without a cache; set XDG_CACHE_HOME to have one")
+        return None
 
 
-def use_compilation_cache(folder: pathlib.Path | None) -> None:
-    """Keeps compiled programs for the next start; None switches that off."""
-    if folder is None:
-        return
+def usable_cache(folder: pathlib.Path) -> pathlib.Path | None:
+    """The folder, made if it is not there; None, after a warning, if nothing can be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(4096))
+    except OSError as error:
+        warn(f"{folder}: cannot be used ({error.strerror}): goes on without a cache there")
+        return None
+    return folder
+
+
+def scene_cache() -> str | None:
+    """Where scenes are kept, as loaders take it."""
+    folder = cache_folder()
+    return None if folder is None else str(folder / "scenes")
+
+
+def use_compilation_cache(folder: pathlib.Path) -> None:
+    """Keeps compiled programs for the next start."""
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
+@functools.cache
 def warn(text: str) -> None:
-    """A line on standard error, for what goes on all the same."""
+    """A line on standard error, for what goes on all the same; said once."""
     print(f"warning: {text}", file=sys.stderr, flush=True)
 
 

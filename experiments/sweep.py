@@ -72,7 +72,8 @@ def claim_folders(settings: list[Setting], folder: pathlib.Path) -> Record:
     """Checks every setting before anything is run, and notes what the sweep is made of."""
     for setting in settings:
         check_choices(setting.config)
-        setting.folder.mkdir(parents=True, exist_ok=True)
+        workdir.check_claim(setting.folder, setting.config)
+    for setting in settings:
         workdir.claim(setting.folder, setting.config)
     rows = [
         {

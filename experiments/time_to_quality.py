@@ -76,7 +76,7 @@ def start_process(folder: pathlib.Path, part: str) -> dict | None:
 def run_part(config, folder: pathlib.Path, part: str, targets: list[str]) -> None:
     """What a process that `start_process` has started does."""
     if part == PREPARE:
-        load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+        load_config_scene(config, cache_dir=runtime.scene_cache())
         return
     print(f"{part} compilation cache:", flush=True)
     runtime.use_compilation_cache(folder / "compiled")

@@ -41,12 +41,13 @@ class Checkpoints:
         warn_fn: Callable[[str], None] = warnings.warn,
     ):
         self._folder, self._warn_fn = pathlib.Path(folder), warn_fn
-        self._manager = ocp.CheckpointManager(
-            self._folder.absolute(),
-            options=ocp.CheckpointManagerOptions(
-                max_to_keep=keep, create=True, enable_async_checkpointing=False
-            ),
-        )
+        with _without_tracebacks():  # nor warnings of what a kill has left half deleted
+            self._manager = ocp.CheckpointManager(
+                self._folder.absolute(),
+                options=ocp.CheckpointManagerOptions(
+                    max_to_keep=keep, create=True, enable_async_checkpointing=False
+                ),
+            )
 
     def save(self, number: int, state, meta: dict) -> None:
         """Writes a checkpoint; an older one of the same number is replaced.

@@ -15,7 +15,7 @@ from ml_collections import config_flags
 
 from experiments import compilation, runtime, workdir
 from experiments.build import build_problem
-from experiments.build_scene import load_config_scene
+from experiments.build_scene import initial_views, load_config_scene
 from experiments.errors import USER_ERRORS, ConfigError
 from experiments.machine import device_name, versions
 from experiments.trained import (
@@ -75,12 +75,14 @@ def trained_runs() -> Iterator[TrainedRun]:
         # A config without rounds ends where all policies begin.
         policy = FLAGS.policy or (config.policies[0] if config.num_rounds else FIRST_ROUND)
         field_kind(policy)  # an unknown policy ends here, before anything is written
-        folder.mkdir(parents=True, exist_ok=True)
-        workdir.claim(folder, config)
+        workdir.check_claim(folder, config)
         seeds = config.seeds if FLAGS.seed is None else (FLAGS.seed,)
         chosen, take_up = [(policy, seed) for seed in seeds], _train_run
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     problem = build_problem(config, scene, field_kind(chosen[0][0]))
+    if take_up is _train_run:
+        initial_views(scene, chosen[0][1], config.num_initial)  # whether there are so many
+        workdir.claim(folder, config)
     for policy, seed in chosen:
         run = take_up(config, problem, folder, policy, seed)
         state = "the end of" if run.completed else "the last checkpoint of"

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.errors import ReportError
+from experiments.files import load_arrays
 from experiments.versioned import read_versioned
 
 SCHEMA_VERSION = 1
@@ -112,10 +113,9 @@ def load_acquisition(run: Run) -> dict[str, np.ndarray] | None:
 
 
 def _load_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray] | None:
-    if not path.exists():
+    try:
+        return load_arrays(path, *keys)
+    except FileNotFoundError:
         return None
-    with np.load(path, allow_pickle=False) as file:
-        missing = [key for key in keys if key not in file]
-        if missing:
-            raise ReportError(f"{path}: lacks {', '.join(missing)}; run the experiment again")
-        return {key: file[key] for key in file.files}
+    except ValueError as error:
+        raise ReportError(f"{error}; run the experiment again, which makes it anew") from error

@@ -18,7 +18,7 @@ from bavs_jax.uncertainty.model import Situation
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from experiments.build import Problem, run_key
 from experiments.evaluate import evaluate_views, spread_evenly
-from experiments.files import write_arrays
+from experiments.files import read_arrays, write_arrays
 from experiments.progress import track
 from experiments.runtime import warn
 
@@ -74,9 +74,8 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
 def photo_curvature(problem: Problem, train: TrainState, folder: pathlib.Path, seed: int):
     """`jac_sq_sum` [G, 3] of all training photos, kept in `folder` once it is made."""
     path = folder / "curvature.npz"
-    if path.exists():
-        with np.load(path) as data:
-            return jnp.asarray(data["jac_sq_sum"])
+    if (kept := read_arrays(path, "jac_sq_sum")) is not None:
+        return jnp.asarray(kept["jac_sq_sum"])
     is_training = np.zeros(len(problem.table.cameras), bool)
     is_training[problem.scene.pool] = True
     toolbox = problem.make_toolbox(track)
