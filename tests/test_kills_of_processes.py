@@ -11,8 +11,14 @@ from tests.toy_runs import TINY, same_results, toy_flags
 ROOT = pathlib.Path(__file__).parents[1]
 FLAGS = toy_flags(policies="('bavs',)", **TINY)
 # One after another on the same folder; each goes on from what the last has left.
-KILLS = (("fsync", 1), ("os.mkdir", 8), ("os.rename", 4), ("write", 90), ("open", 40))
-KILLS += (("os.remove", 12), ("os.rename", 12), ("fsync", 4))
+KILLS = (
+    ("fsync", 1),
+    ("os.mkdir", 8),
+    ("os.rename", 3),
+    ("write", 60),
+    ("os.remove", 5),
+    ("open", 20),
+)
 
 
 @pytest.mark.slow
