@@ -95,9 +95,8 @@ def test_every_script_is_tried():
 def test_a_script_that_is_stopped_says_so_in_one_line(tmp_path, name, number):
     flag, file = READS[name]
     write_nerfstudio(tmp_path / "data")
-    (tmp_path / "field" / "seed_0" / "checkpoints" / "1").mkdir(
-        parents=True
-    )  # so its config counts
+    # Then the config that is there counts.
+    (tmp_path / "field" / "seed_0" / "checkpoints" / "1").mkdir(parents=True)
     os.mkfifo(tmp_path / file)
     flags = [f"--workdir={tmp_path}", *([flag.format(tmp_path)] if flag else [])]
     check_stopped(start(f"experiments.{name}", *flags), number, tmp_path / file)
