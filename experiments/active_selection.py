@@ -54,12 +54,12 @@ def make_parts(
     parts = all_parts(config.policies, config.seeds)
     if only is not None:
         parts = [find_part(only, parts)]
-    folder.mkdir(parents=True, exist_ok=True)
-    workdir.claim(folder, config)
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    workdir.check_claim(folder, config)
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     check_views(config, scene)
     print(f"{scene.name}: {len(scene.pool)} views to choose from, {len(scene.test)} test views")
     problems = {kind: build_problem(config, scene, kind, mesh) for kind in {p.kind for p in parts}}
+    workdir.claim(folder, config)
 
     def make(part, shared=None) -> Run:
         # Other processes may make other parts of the same folder, and need the same round 0.

@@ -14,6 +14,10 @@ class WorkdirError(ValueError):
     """A folder that cannot be used: one line that names the file, the field and the fix."""
 
 
+class ReportError(ValueError):
+    """A file that cannot be used: one line that names the file, the field and the fix."""
+
+
 # What a script prints in place of a traceback; the last is a loss that is not finite.
 USER_ERRORS = (
     SceneError,
@@ -22,6 +26,7 @@ USER_ERRORS = (
     ExportError,
     ConfigError,
     WorkdirError,
+    ReportError,
     FloatingPointError,
 )
 

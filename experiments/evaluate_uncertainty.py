@@ -42,11 +42,11 @@ flags.DEFINE_string("workdir", None, "Folder for fields, uncertainty.json and un
 def evaluate(config, folder: pathlib.Path, command: str) -> None:
     """All seeds, then the summary and the page."""
     start = time.monotonic()
-    folder.mkdir(parents=True, exist_ok=True)
-    workdir.claim(folder, config)
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    workdir.check_claim(folder, config)
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     check_views(config, scene)
     problem = build_problem(config, scene)
+    workdir.claim(folder, config)
     for seed in config.seeds:
         measure_seed(config, problem, folder, seed, command)
     numbers, page = write_summary(config, scene, folder, command)

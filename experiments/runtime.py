@@ -2,31 +2,63 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 import pathlib
 import sys
+import tempfile
 import threading
 from collections.abc import Callable
 
 import jax
 from absl import app, flags, logging
 
-from experiments.errors import ConfigError, one_line, shown
+from experiments import signals
+from experiments.errors import USER_ERRORS, ConfigError, one_line, shown
 
 
-def cache_folder() -> pathlib.Path:
-    """Where scenes and compiled programs are kept: `$XDG_CACHE_HOME` or `~/.cache`."""
-    root = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-    return pathlib.Path(root) / "bavs_jax"
+def cache_folder() -> pathlib.Path | None:
+    """Where scenes and compiled programs are kept: in `$XDG_CACHE_HOME` or `~/.cache`.
+
+    None, after a warning, where nothing can be.
+    """
+    root = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    try:
+        return usable_cache(pathlib.Path(root).expanduser() / "bavs_jax")
+    except RuntimeError as error:  # nobody's home
+        warn(f"{root}: {error}: goes on without a cache; set XDG_CACHE_HOME to have one")
+        return None
 
 
-def use_compilation_cache(folder: pathlib.Path | None) -> None:
-    """Keeps compiled programs for the next start; None switches that off."""
-    if folder is None:
-        return
+def usable_cache(folder: pathlib.Path) -> pathlib.Path | None:
+    """The folder, made if it is not there; None, after a warning, if nothing can be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(4096))
+    except OSError as error:
+        warn(f"{folder}: cannot be used ({error.strerror}): goes on without a cache there")
+        return None
+    return folder
+
+
+def scene_cache() -> str | None:
+    """Where scenes are kept, as loaders take it."""
+    folder = cache_folder()
+    return None if folder is None else str(folder / "scenes")
+
+
+def use_compilation_cache(folder: pathlib.Path) -> None:
+    """Keeps compiled programs for the next start."""
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+@functools.cache
+def warn(text: str) -> None:
+    """A line on standard error, for what goes on all the same; said once."""
+    print(f"warning: {text}", file=sys.stderr, flush=True)
 
 
 def command_line() -> str:
@@ -82,7 +114,10 @@ def check_finite() -> None:
 
 
 def run_script(main: Callable[[], None]) -> None:
-    """Runs a script's `main()` after reading its flags; wrong ones end in one line."""
+    """Runs a script's `main()` after reading its flags; what goes wrong ends in one line.
+
+    So do ctrl-C and SIGTERM, with the exit codes that shells give for them.
+    """
 
     def parse(argv):
         try:
@@ -104,9 +139,15 @@ def run_script(main: Callable[[], None]) -> None:
             sys.exit(f"error: unknown argument {argv[1]!r}; options are given as --name=value")
         # Checkpoint libraries report every write at INFO; warnings and errors still show.
         logging.set_verbosity(logging.WARNING)
+        signals.interrupt_work()
         try:
             main()
-        except ConfigError as error:
-            sys.exit(f"error: {error}")
+        except BaseException as error:
+            # Libraries may make another error of the interrupt.
+            if number := signals.received():
+                signals.end(number)
+            if isinstance(error, (*USER_ERRORS, OSError)):
+                sys.exit(f"error: {' '.join(str(error).split())}")
+            raise
 
     app.run(without_arguments, flags_parser=parse)

@@ -102,14 +102,14 @@ def suggest_views(
 ) -> None:
     """Trains, proposes, chooses and writes."""
     begin = time.monotonic()
+    workdir.check_claim(folder, config)
     scene = load_scene(FLAGS.loader, root=data, image_size=FLAGS.image_size)
     scene = training.all_for_training(scene, FLAGS.holdout)
-    folder.mkdir(parents=True, exist_ok=True)
-    workdir.claim(folder, config)
     around = places.look_around(scene, options)
     print(f"{scene.name}: {len(scene.pool)} photos to train on, {len(scene.test)} left out")
 
     problem = build_problem(config, scene)
+    workdir.claim(folder, config)
     field_folder = folder / "field" / f"seed_{options.seed}"
     train = training.train_field(config, problem, field_folder, options.seed)
     jac_sq_sum = training.photo_curvature(problem, train, field_folder, options.seed)

@@ -12,7 +12,6 @@ ablations do. Started again, a sweep goes on: what is finished is not run again.
 from __future__ import annotations
 
 import pathlib
-import signal
 import sys
 
 from absl import flags
@@ -73,8 +72,8 @@ def claim_folders(settings: list[Setting], folder: pathlib.Path) -> Record:
     """Checks every setting before anything is run, and notes what the sweep is made of."""
     for setting in settings:
         check_config(setting.config)
+        workdir.check_claim(setting.folder, setting.config)
     for setting in settings:
-        setting.folder.mkdir(parents=True, exist_ok=True)
         workdir.claim(setting.folder, setting.config)
     rows = [
         {
@@ -124,14 +123,10 @@ def main() -> None:
     flag = FLAGS["config"]
     given = [f"--config={config_flags.get_config_filename(flag)}"]
     given += [option_flag(*item) for item in config_flags.get_override_values(flag).items()]
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         failed = sweep(config, folder, given)
     except (*USER_ERRORS, ReportError, OSError) as error:
         sys.exit(f"error: {' '.join(str(error).split())}")
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        sys.exit(128 + signal.SIGINT)
     if failed:
         sys.exit(f"error: {failed} trial{'s' if failed > 1 else ''} failed; reasons are above")
 

@@ -57,12 +57,14 @@ SCHEMA_VERSION = 1
 def start_process(folder: pathlib.Path, part: str) -> dict | None:
     """One part in a process of its own; what it wrote, if anything.
 
-    This process never touches the device, which a second one might not be able to share.
+    This process never touches the device, which a second one might not be able to share. Ctrl-C
+    reaches this one only, which ends the other.
     """
     command = [sys.executable, "-m", "experiments.time_to_quality", *sys.argv[1:]]
     path = folder / f"{part}.json"
     path.unlink(missing_ok=True)
-    done = subprocess.run([*command, f"--part={part}", f"--started={time.time()!r}"], check=False)
+    command += [f"--part={part}", f"--started={time.time()!r}"]
+    done = subprocess.run(command, check=False, start_new_session=True)
     if done.returncode:
         sys.exit(done.returncode)
     if not path.exists():
@@ -75,7 +77,7 @@ def start_process(folder: pathlib.Path, part: str) -> dict | None:
 def run_part(config, folder: pathlib.Path, part: str, targets: list[str]) -> None:
     """What a process that `start_process` has started does."""
     if part == PREPARE:
-        load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+        load_config_scene(config, cache_dir=runtime.scene_cache())
         return
     print(f"{part} compilation cache:", flush=True)
     runtime.use_compilation_cache(folder / "compiled")

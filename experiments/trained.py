@@ -96,7 +96,7 @@ def saved_config(workdir: pathlib.Path) -> ConfigDict:
         raise WorkdirError(
             f"{path}: does not exist: give the --workdir of a run, or a --config to start one"
         ) from error
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise WorkdirError(f"{path}: cannot be read ({reason}): start the run again") from error
     return check_config(config, name=str(path))

@@ -275,7 +275,10 @@ def load_procedural(
         cached = read_cache(path, num_pixels)
     pixels, depth = capture(cameras) if cached is None else cached
     if path is not None and cached is None:
-        write_cache(path, pixels, depth)
+        try:
+            write_cache(path, pixels, depth)
+        except OSError as error:  # such as a full disk
+            warnings.warn(f"{path}: cannot be written ({error.strerror})", stacklevel=2)
 
     return Scene(
         name="procedural",

@@ -52,7 +52,7 @@ def measure_run(
       `curve`, a list of `{"step", "seconds", "psnr"}`, one for each look; `scene`, `device` and
       `num_test_views`.
     """
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     problem = build_problem(config, scene)
     initial = initial_views(scene, SEED, num_views)
     view_ids = spread_evenly(scene.test, num_test_views)

@@ -77,14 +77,15 @@ def trained_runs() -> Iterator[TrainedRun]:
         # A config without rounds ends where all policies begin.
         policy = FLAGS.policy or (config.policies[0] if config.num_rounds else FIRST_ROUND)
         field_kind(policy)  # an unknown policy ends here, before anything is written
-        folder.mkdir(parents=True, exist_ok=True)
-        workdir.claim(folder, config)
+        workdir.check_claim(folder, config)
         seeds = config.seeds if FLAGS.seed is None else (FLAGS.seed,)
         chosen, take_up = [(policy, seed) for seed in seeds], _train_run
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     if take_up is _train_run:
         check_views(config, scene)
     problem = build_problem(config, scene, field_kind(chosen[0][0]))
+    if take_up is _train_run:
+        workdir.claim(folder, config)
     for policy, seed in chosen:
         run = take_up(config, problem, folder, policy, seed)
         state = "the end of" if run.completed else "the last checkpoint of"

@@ -49,7 +49,7 @@ def plan_ahead(folder: pathlib.Path, runs: Sequence[FinishedRun]) -> list[Finish
       WorkdirError: the runs' pictures were taken at free poses.
     """
     config = saved_config(folder)
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     problem = build_problem(config, scene)
     if problem.has_empty_views:
         raise WorkdirError(

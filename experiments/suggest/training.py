@@ -17,9 +17,10 @@ from bavs_jax.uncertainty.model import Situation
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from experiments.build import Problem
 from experiments.evaluate import evaluate_views, spread_evenly
-from experiments.files import write_arrays
+from experiments.files import read_arrays, write_arrays
 from experiments.keys import run_key, stream_key
 from experiments.progress import track
+from experiments.runtime import warn
 
 
 def all_for_training(scene: Scene, holdout: int) -> Scene:
@@ -42,11 +43,12 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
       FloatingPointError: the loss is not finite.
     """
     pool, steps = problem.scene.pool, config.train.steps_per_call
-    checkpoints = Checkpoints(folder / "checkpoints", keep=1)
+    checkpoints = Checkpoints(folder / "checkpoints", warn_fn=warn)
     init_key = stream_key(seed, "init")
     state = init_active_state(problem.init_train(init_key), problem.table, pool)
-    if checkpoints.latest() is not None:
-        saved, meta = checkpoints.restore(state.train)
+    found = checkpoints.restore(state.train)
+    if found is not None:
+        saved, meta = found
         state = state.replace(train=saved, calls=jnp.int32(meta["calls"]))
     left = problem.calls_per_round - int(state.calls)
     if left > 0:
@@ -72,9 +74,8 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
 def photo_curvature(problem: Problem, train: TrainState, folder: pathlib.Path, seed: int):
     """`jac_sq_sum` [G, 3] of all training photos, kept in `folder` once it is made."""
     path = folder / "curvature.npz"
-    if path.exists():
-        with np.load(path) as data:
-            return jnp.asarray(data["jac_sq_sum"])
+    if (kept := read_arrays(path, "jac_sq_sum")) is not None:
+        return jnp.asarray(kept["jac_sq_sum"])
     is_training = np.zeros(len(problem.table.cameras), bool)
     is_training[problem.scene.pool] = True
     toolbox = problem.make_toolbox(track)
