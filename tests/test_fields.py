@@ -46,6 +46,19 @@ def test_the_gradient_of_a_level_adds_up_all_that_was_read_of_a_row(rows):
     np.testing.assert_allclose((grad * other).sum(), expected, rtol=1e-4)
 
 
+def test_the_last_cell_owns_its_upper_face():
+    table = jax.random.normal(jax.random.key(0), (6**3, 2))
+
+    def slope(x):
+        return jax.jacobian(lambda x: interpolate_level(table, x[None], 5)[0])(x)
+
+    # A level is linear along each axis of a cell, so nothing changes up to its face.
+    for axis in np.eye(3):
+        face = np.array([0.3, 0.5, 0.7]) * (1 - axis) + axis
+        inside = slope(jnp.asarray(face - 0.1 * axis)) @ axis
+        np.testing.assert_allclose(slope(jnp.asarray(face)) @ axis, inside, rtol=1e-4)
+
+
 def test_hashed_level_is_continuous_across_cells_and_in_range():
     table = jax.random.normal(jax.random.key(0), (256, 2))  # far fewer rows than vertices
     x = jnp.linspace(0.1, 0.9, 4001)

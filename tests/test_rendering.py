@@ -121,7 +121,11 @@ def test_valid_slots_come_first_and_cover_what_is_occupied():
         mask = np.asarray(samples.sample_mask)
         assert (np.diff(mask.astype(int), axis=1) <= 0).all()
         assert (np.asarray(samples.deltas)[~mask] == 0).all()
+    counts = np.asarray(full.sample_mask.sum(-1))
     assert not full.thinned.any() and thin.thinned.any()
+    for slots in (8, counts.max() - 1, counts.max()):
+        samples = march(rays, occupancy, options(num_slots=int(slots)))
+        np.testing.assert_array_equal(samples.thinned, counts > slots)
     # A thinned ray still stands for (nearly) its whole way: at most one stride more.
     length, thin_length = full.deltas.sum(-1), thin.deltas.sum(-1)
     stride = thin.deltas.max(-1)
@@ -222,6 +226,15 @@ def test_one_pass_keeps_whole_rays_or_none():
     assert 0 < int(ray_mask.sum()) < len(mask)
     assert int(mask.sum(-1)[ray_mask].sum()) <= capacity
     want = jnp.where(mask & ray_mask[:, None], table, 0.0)
+    np.testing.assert_array_equal(got, want)
+
+
+@pytest.mark.parametrize("spare, whole_rays", [(0, 3), (-1, 2), (1, 3)])
+def test_one_pass_takes_a_ray_that_just_fits(spare, whole_rays):
+    mask = jnp.arange(12) < jnp.array([5, 0, 12, 4])[:, None]
+    got, ray_mask = evaluate_one_pass(lambda r, s, v: s + 1.0, mask, capacity=17 + spare)
+    assert ray_mask.tolist() == [row < whole_rays for row in range(4)]
+    want = jnp.where(mask & ray_mask[:, None], jnp.arange(1.0, 13.0), 0.0)
     np.testing.assert_array_equal(got, want)
 
 
