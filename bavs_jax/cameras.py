@@ -68,8 +68,11 @@ def pixel_rays(cameras: Cameras, view_ids: jax.Array, pixels: jax.Array) -> Rays
         )
     local = lens_directions(xy, lens=cameras.lens)
     pose = cameras.world_from_cam[view_ids]
-    # Spelt out rather than a matrix product: exact float32 on every accelerator.
-    world = (pose[..., :3, :3] * local[..., None, :]).sum(-1)
+    # Spelt out rather than a matrix product: exact float32 on every accelerator. By components
+    # rather than as a sum over an axis: XLA for CPUs may fuse such a sum with the division by the
+    # norm, and then gives most rays the directions of others.
+    right, up, back = (local[..., i, None] for i in range(3))
+    world = right * pose[..., :3, 0] + up * pose[..., :3, 1] + back * pose[..., :3, 2]
     directions = world / jnp.linalg.norm(world, axis=-1, keepdims=True)
     return Rays(origins=pose[..., :3, 3], directions=directions)
 

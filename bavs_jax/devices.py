@@ -8,6 +8,7 @@ device and leave everything as it is.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -58,7 +59,12 @@ def over_rays(fn: Callable, mesh: Mesh | None, *, spread: tuple[bool, ...]) -> C
 def jit_over_rays(fn: Callable, mesh: Mesh | None, *, spread: tuple[bool, ...]) -> Callable:
     """Compiles `over_rays`; what it returns is whole on every device, and so in every process."""
     fn_over_rays = over_rays(fn, mesh, spread=spread)
-    return jax.jit(lambda *args: gather_rays(fn_over_rays(*args), mesh))
+
+    @functools.wraps(fn)  # traces and profiles bear the name of what they run
+    def gathered(*args):
+        return gather_rays(fn_over_rays(*args), mesh)
+
+    return jax.jit(gathered)
 
 
 def spread_rays(tree, mesh: Mesh | None):

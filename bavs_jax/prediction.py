@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import jax
 import numpy as np
 
-from bavs_jax.cameras import Cameras, num_pixels, take
+from bavs_jax.cameras import Cameras
 from bavs_jax.candidates import Candidates
 from bavs_jax.fields.deformation import cell_sides, vertices_in_box
 from bavs_jax.selection.predicted_gain import (
@@ -23,9 +22,9 @@ from bavs_jax.selection.predicted_gain import (
     variance_gain_db,
     views_gain_db,
 )
-from bavs_jax.sources import WEIGHTING
+from bavs_jax.sources import WEIGHTING, make_view_rays_fn
+from bavs_jax.training.batches import PixelTable
 from bavs_jax.uncertainty.model import Situation, Toolbox
-from bavs_jax.uncertainty.scoring import reduced_cameras
 
 # Candidates, evenly spaced in their order, whose rays stand for those of test views.
 NUM_REFERENCE = 16
@@ -59,20 +58,20 @@ def make_predict_fn(
         cameras = candidates.cameras
         num = min(len(cameras), num_reference)
         places = np.arange(num) * len(cameras) // num
-        is_training = np.flatnonzero(situation.is_training_view)
-        training = take(situation.table.cameras, is_training)
-        known, reference = (
-            summed_curvature(toolbox, situation, some, image_scale)
-            for some in (training, take(cameras, places))
+        table, is_training = situation.table, np.flatnonzero(situation.is_training_view)
+        known = summed_curvature(
+            *(toolbox, situation, table.cameras, is_training, image_scale), table
         )
+        reference = summed_curvature(toolbox, situation, cameras, places, image_scale)
         cell_prior = offset_precision(cell_sides(toolbox.grid), num_rays=situation.num_rays)
         paper_prior = 2.0 * toolbox.laplace.prior_weight
-        positions, chosen = np.asarray(cameras.positions), np.asarray(training.positions)
+        positions = np.asarray(cameras.positions)
+        chosen = np.asarray(table.cameras.positions)[is_training]
         predictions = []
         for batch in batches:
-            picks = take(cameras, np.asarray(batch))
-            added = summed_curvature(toolbox, situation, picks, image_scale)
-            distance = distance_gain_db(positions, chosen, picks.positions)
+            picks = np.asarray(batch)
+            added = summed_curvature(toolbox, situation, cameras, picks, image_scale)
+            distance = distance_gain_db(positions, chosen, positions[picks])
             predictions.append(
                 {
                     "variance_db": variance_gain_db(reference, known + cell_prior, added),
@@ -83,47 +82,31 @@ def make_predict_fn(
                 }
             )
             known = known + added
-            chosen = np.concatenate([chosen, np.asarray(picks.positions)])
+            chosen = np.concatenate([chosen, positions[picks]])
         return predictions
 
     return predict
 
 
 def summed_curvature(
-    toolbox: Toolbox, situation: Situation, cameras: Cameras, image_scale: float
+    toolbox: Toolbox,
+    situation: Situation,
+    cameras: Cameras,
+    indices,
+    image_scale: float,
+    table: PixelTable | None = None,
 ) -> np.ndarray:
-    """What the photos of all n cameras together add to the precision, [G, 3] float64 >= 0.
+    """What the photos of some cameras together add to the precision, [G, 3] float64 >= 0.
 
-    As `make_candidate_curvature_fn`, but one sum over all cameras. Views of different sizes are
-    scaled up together, in proportion to the pixels of their reduced images.
+    As `make_candidate_curvature_fn`, but one sum over all of `indices` [n]. Views of different
+    sizes are scaled up together, in proportion to the pixels of their reduced images. `table`:
+    where they are views trained on, see `make_view_rays_fn`.
     """
-    table, small = situation.table, reduced_cameras(cameras, image_scale)
-    small_rays = np.asarray(num_pixels(small))
-    total = np.zeros((toolbox.grid.num_vertices, 3))
-    # The cameras stand in for the first views, so that all arrays keep the table's shapes and
-    # nothing is compiled anew; their pixels are not looked at.
-    most = len(table.cameras)
-    for rows in np.array_split(np.arange(len(cameras)), -(-len(cameras) // most)):
-        stand_in = jax.tree.map(
-            lambda old, new, rows=rows: np.concatenate(
-                [np.asarray(new)[rows].astype(old.dtype), np.asarray(old)[len(rows) :]]
-            ),
-            table.cameras,
-            small,
-        )
-        total += np.asarray(
-            toolbox.curvature(
-                situation.train,
-                table.replace(cameras=stand_in),
-                np.repeat(np.arange(len(rows)), small_rays[rows]).astype(np.int32),
-                np.concatenate([np.arange(n, dtype=np.int32) for n in small_rays[rows]]),
-                None,
-                weighting=WEIGHTING,
-            ),
-            np.float64,
-        )
+    of_rays, places, scale = make_view_rays_fn(cameras, image_scale, table)(indices)
+    total = np.asarray(
+        toolbox.curvature(situation.train, label=None, weighting=WEIGHTING, **of_rays), np.float64
+    )
     if toolbox.laplace.extent == "box":
-        total *= np.asarray(vertices_in_box(toolbox.grid))[:, None]
+        total = total * np.asarray(vertices_in_box(toolbox.grid))[:, None]
     # A sum of squares that was summed in another order may fall short of 0 by its rounding.
-    scale = 2.0 / situation.num_rays * np.asarray(num_pixels(cameras)).sum() / small_rays.sum()
-    return scale * np.maximum(total, 0.0)
+    return 2.0 / situation.num_rays * scale[places].mean() * np.maximum(total, 0.0)

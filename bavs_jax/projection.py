@@ -24,9 +24,10 @@ def project(camera: Cameras, points: jax.Array) -> tuple[jax.Array, jax.Array]:
       is_in_image [...] bool: in front of the camera, within the lens's range and within the image.
     """
     pose = camera.world_from_cam
-    # Spelt out rather than a matrix product: exact float32 on every accelerator.
-    local = (pose[:, :3] * (points - pose[:, 3])[..., :, None]).sum(-2)
-    right, down, ahead = local[..., 0], -local[..., 1], -local[..., 2]
+    # Spelt out by components for the reasons given in `pixel_rays`.
+    x, y, z = (points[..., i] - pose[i, 3] for i in range(3))
+    right, up, back = (x * pose[0, i] + y * pose[1, i] + z * pose[2, i] for i in range(3))
+    down, ahead = -up, -back
     across = jnp.stack([right, down], axis=-1)
     if camera.lens == "fisheye":
         radius = jnp.linalg.norm(across, axis=-1)

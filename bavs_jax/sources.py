@@ -13,6 +13,7 @@ import numpy as np
 from bavs_jax.cameras import Cameras, num_pixels, take
 from bavs_jax.candidates import Candidates
 from bavs_jax.fields.deformation import vertex_positions, vertices_in_box
+from bavs_jax.scenes.images import area_resize
 from bavs_jax.selection.directional import DirectionalInformation, Look, make_precision_fn
 from bavs_jax.selection.information import (
     DEFAULT_MAX_BYTES,
@@ -20,10 +21,12 @@ from bavs_jax.selection.information import (
     make_cached_curvature_fn,
 )
 from bavs_jax.selection.policy import Policy
+from bavs_jax.training.batches import PixelTable
 from bavs_jax.uncertainty.model import ModelFns, Situation, Toolbox
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
 from bavs_jax.uncertainty.scoring import mean_uncertainty, reduced_cameras
+from bavs_jax.uncertainty.streaming import rays_through_pixels
 
 WEIGHTING = "eq13"  # of candidates: the only one that needs no photo
 
@@ -180,18 +183,19 @@ def directional_information(
 def training_looks(toolbox: Toolbox, situation: Situation, image_scale: float) -> tuple[Look, ...]:
     """The curvature that each training view by itself has brought, at a reduced size.
 
-    Of the same field and by the same rule as that of candidates, so that both can be compared.
+    Of the same field and by the same rule as that of candidates, so that both can be compared; but
+    a view that was trained on is read with its own code, and without its masked pixels.
     """
-    cameras = take(situation.table.cameras, np.flatnonzero(situation.is_training_view))
+    views = np.flatnonzero(situation.is_training_view)
+    view_rays = make_view_rays_fn(situation.table.cameras, image_scale, situation.table)
     curvature_fn = make_cached_curvature_fn(
-        make_candidate_curvature_fn(toolbox, situation, cameras, image_scale),
+        _make_curvature_fn(toolbox, situation, view_rays),
         num_vertices=toolbox.grid.num_vertices,
         max_bytes=0,
         group_size=toolbox.group_size,
     )
-    curvatures = curvature_fn(range(len(cameras)))
-    positions = np.asarray(cameras.positions)
-    return tuple(Look(rows, h, place) for (rows, h), place in zip(curvatures, positions))
+    positions = np.asarray(situation.table.cameras.positions)[views]
+    return tuple(Look(rows, h, place) for (rows, h), place in zip(curvature_fn(views), positions))
 
 
 def make_candidate_curvature_fn(
@@ -205,34 +209,72 @@ def make_candidate_curvature_fn(
     (`LaplaceOptions.extent`). Rays of all n cameras share compiled calls; n is at most
     `toolbox.group_size`.
     """
+    return _make_curvature_fn(toolbox, situation, make_view_rays_fn(cameras, image_scale))
+
+
+def _make_curvature_fn(toolbox: Toolbox, situation: Situation, view_rays: Callable) -> Callable:
+    """`make_candidate_curvature_fn` of the cameras of `view_rays`."""
     counts = 1.0
     if toolbox.laplace.extent == "box":
         counts = vertices_in_box(toolbox.grid)[:, None]
-    small = reduced_cameras(cameras, image_scale)
-    whole_rays = num_pixels(cameras)
-    small_rays = num_pixels(small)
-    table = situation.table
-    most = toolbox.group_size
 
     def curvature(indices):
-        # The cameras stand in for the first views, so that all arrays keep the table's shapes and
-        # nothing is compiled anew; their pixels are not looked at.
-        places, sources = np.arange(len(indices)), np.resize(indices, most)
-        stand_in = jax.tree.map(lambda x, y: x.at[:most].set(y[sources]), table.cameras, small)
-        num_rays = small_rays[indices]
+        of_rays, places, scale = view_rays(indices)
         added = toolbox.curvature(
-            situation.train,
-            table.replace(cameras=stand_in),
-            np.repeat(places, num_rays).astype(np.int32),
-            np.concatenate([np.arange(num, dtype=np.int32) for num in num_rays]),
-            None,
-            weighting=WEIGHTING,
-            by_view=True,
+            situation.train, label=None, weighting=WEIGHTING, group_ids=places, **of_rays
         )
-        scale = 2.0 / situation.num_rays * whole_rays[indices] / num_rays
-        return counts * scale.astype(np.float32)[:, None, None] * added[: len(indices)]
+        scale = (2.0 / situation.num_rays * scale).astype(np.float32)[:, None, None]
+        return counts * scale * added[: len(indices)]
 
     return curvature
+
+
+def make_view_rays_fn(cameras: Cameras, image_scale: float, table: PixelTable | None = None):
+    """Makes `view_rays(indices [n]) -> (of_rays, places, scale)`: the rays of reduced images.
+
+    `of_rays` are keywords of `Toolbox.curvature` for all N rays, `places` [N] int32 says of which
+    of the n views each is, and `scale` [n] is how many pixels of the photo a ray stands for.
+
+    Args:
+      cameras: of which `indices` are; a field reads them as it does when it renders.
+      image_scale: of width and height.
+      table: where the cameras are those of views trained on: then a field reads each with its own
+        code, and a ray counts by the share of its pixels that is not masked.
+    """
+    small = reduced_cameras(cameras, image_scale)
+    whole_rays, small_rays = num_pixels(cameras), num_pixels(small)
+
+    def view_rays(indices):
+        num_rays = small_rays[indices]
+        views = np.repeat(indices, num_rays).astype(np.int32)
+        within = np.concatenate([np.arange(num, dtype=np.int32) for num in num_rays])
+        of_rays = {"rays": rays_through_pixels(small, views, within)}
+        if table is not None:
+            of_rays["view_ids"] = views
+            of_rays["ray_weight"] = _unmasked_shares(table, indices, np.asarray(small.sizes))
+        places = np.repeat(np.arange(len(indices), dtype=np.int32), num_rays)
+        return of_rays, places, whole_rays[indices] / num_rays
+
+    return view_rays
+
+
+def _unmasked_shares(table: PixelTable, view_ids, sizes: np.ndarray) -> np.ndarray | None:
+    """Share of each pixel of reduced views that is trained on, [N] in [0, 1]; None where all are.
+
+    Args:
+      table: the scene's pixels.
+      view_ids: [n] views.
+      sizes: [V, 2] width and height of the reduced images.
+    """
+    if len(table.pixel_mask) == 1:
+        return None
+    mask, offsets = np.asarray(table.pixel_mask), np.asarray(table.offsets)
+    shares = []
+    for view in view_ids:
+        width, height = (int(n) for n in np.asarray(table.cameras.sizes)[view])
+        image = mask[offsets[view] : offsets[view + 1]].reshape(height, width, 1)
+        shares.append(area_resize(image.astype(np.float64), *(int(n) for n in sizes[view])))
+    return np.concatenate([share.ravel() for share in shares]).astype(np.float32)
 
 
 @contextlib.contextmanager

@@ -13,7 +13,8 @@ import numpy as np
 from bavs_jax.cameras import Cameras, take
 from bavs_jax.scenes.base import photo_cameras
 from bavs_jax.scenes.poses import user_transforms
-from experiments.files import write_arrays, write_json
+from experiments.errors import WorkdirError
+from experiments.files import load_arrays, write_arrays, write_json
 
 CAMERA_FIELDS = ("world_from_cam", "intrinsics", "distortion", "sizes")
 
@@ -43,12 +44,15 @@ def save_choice(folder: pathlib.Path, number: int, choice, *, in_scene: bool) ->
 
 
 def load_choices(folder: pathlib.Path, num_rounds: int) -> list[dict[str, np.ndarray]]:
-    """The choices of rounds 1 .. num_rounds."""
-    choices = []
-    for number in range(1, num_rounds + 1):
-        with np.load(_choice_path(folder, number)) as data:
-            choices.append(dict(data))
-    return choices
+    """The choices of rounds 1 .. num_rounds.
+
+    Raises:
+      WorkdirError: one is missing or damaged; the field that made it is no more.
+    """
+    try:
+        return [load_arrays(_choice_path(folder, n)) for n in range(1, num_rounds + 1)]
+    except (FileNotFoundError, ValueError) as error:
+        raise WorkdirError(f"{error}: delete {folder} to run it anew") from error
 
 
 def acquisition_arrays(scene, initial, choices: list[dict]) -> dict[str, np.ndarray]:

@@ -20,13 +20,14 @@ from ml_collections import config_flags
 from bavs_jax.selection.policies import POLICIES
 from experiments import compilation, job, runtime, workdir
 from experiments.build import build_problem
-from experiments.build_scene import load_config_scene
-from experiments.errors import USER_ERRORS
+from experiments.build_scene import check_views, load_config_scene
+from experiments.errors import USER_ERRORS, one_line
 from experiments.files import exclusive
 from experiments.parts import all_parts, find_part
 from experiments.processes import is_first_process
 from experiments.report import write_report
 from experiments.runner import Run
+from experiments.schema import given_config
 
 FLAGS = flags.FLAGS
 flags.adopt_module_key_flags(compilation)
@@ -53,11 +54,12 @@ def make_parts(
     parts = all_parts(config.policies, config.seeds)
     if only is not None:
         parts = [find_part(only, parts)]
-    folder.mkdir(parents=True, exist_ok=True)
-    workdir.claim(folder, config)
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    workdir.check_claim(folder, config)
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
+    check_views(config, scene)
     print(f"{scene.name}: {len(scene.pool)} views to choose from, {len(scene.test)} test views")
     problems = {kind: build_problem(config, scene, kind, mesh) for kind in {p.kind for p in parts}}
+    workdir.claim(folder, config)
 
     def make(part, shared=None) -> Run:
         # Other processes may make other parts of the same folder, and need the same round 0.
@@ -93,14 +95,11 @@ def main() -> None:
         for name, policy in POLICIES.items():
             print(f"{name:16} {policy.summary}")
         return
-    if FLAGS.config is None:
-        sys.exit("error: --config: is missing; try --config=experiments/configs/quickstart.py")
-    if not FLAGS.workdir:
-        sys.exit("error: --workdir: is missing; name a folder for the results")
+    config = given_config("experiments/configs/quickstart.py")
+    folder = runtime.given_folder("workdir", "a folder for the results")
     compilation.start_cache()
     if FLAGS.end_with_stdin:
         runtime.end_with_parent()
-    config, folder = FLAGS.config, pathlib.Path(FLAGS.workdir)
     try:
         mesh = job.start_job()
         if FLAGS.part is not None:
@@ -108,8 +107,7 @@ def main() -> None:
         else:
             run_all(config, folder, runtime.command_line(), mesh)
     except OSError as error:
-        # The config file is only read when it is first used.
-        sys.exit(f"error: {' '.join(str(error).split())}")
+        sys.exit(f"error: {one_line(error)}")
     except USER_ERRORS as error:
         sys.exit(f"error: {error}")
 

@@ -11,7 +11,6 @@ what is counted. Other programs on the machine make every number worse.
 
 from __future__ import annotations
 
-import pathlib
 import sys
 
 import jax
@@ -21,10 +20,11 @@ from ml_collections import config_flags
 from experiments import runtime
 from experiments.bench.measure import benchmark
 from experiments.bench.results import BENCHMARK, benchmark_tables
-from experiments.bench.settings import default_sizes
+from experiments.bench.settings import check_sizes, default_sizes
 from experiments.configs import base
 from experiments.errors import USER_ERRORS
 from experiments.report.collected import collected_text
+from experiments.schema import given_config
 
 FLAGS = flags.FLAGS
 config_flags.DEFINE_config_file(
@@ -40,20 +40,19 @@ config_flags.DEFINE_config_dict(
     "How much is measured, as --sizes.name=value; explained in experiments/bench/settings.py.",
 )
 flags.DEFINE_string("workdir", None, "Folder for benchmark.json, benchmark.html and the trace.")
-flags.DEFINE_integer("num_views", 20, "Training views.")
+flags.DEFINE_integer("num_views", 20, "Training views.", 1)
 flags.DEFINE_bool("growth", True, "Measure how each stage grows too.")
 flags.DEFINE_bool("profile", False, "Write a trace of one run of each stage to WORKDIR/trace.")
 
 
 def main() -> None:
-    if not FLAGS.workdir:
-        sys.exit("error: --workdir: is missing; name a folder for the results")
+    config, folder = given_config(), runtime.given_folder("workdir", "a folder for the results")
+    check_sizes(FLAGS.sizes)
     # Times of compilation are those of a first start, whatever an earlier one has left behind.
     jax.config.update("jax_enable_compilation_cache", False)
-    folder = pathlib.Path(FLAGS.workdir)
     try:
         result = benchmark(
-            FLAGS.config,
+            config,
             FLAGS.sizes,
             folder,
             num_views=FLAGS.num_views,

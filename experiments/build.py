@@ -14,18 +14,15 @@ from jax.sharding import Mesh
 
 from bavs_jax import active
 from bavs_jax.devices import num_shards, put_on_all
-from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.fields.deformation import DeformationGrid, offset_unit
 from bavs_jax.metrics.perceptual import make_lpips_fn
 from bavs_jax.prediction import make_predict_fn
 from bavs_jax.scenes import Scene
 from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
-from bavs_jax.selection.policy import MODES
 from bavs_jax.sources import SourceOptions, make_sources_fn
-from bavs_jax.training.batches import PixelTable, make_pixel_table
+from bavs_jax.training.batches import PixelTable, make_pixel_table, num_training_pixels
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.channel import EXTENTS, SCALES, VARIANTS
-from bavs_jax.uncertainty.curvature import WEIGHTINGS
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, LaplaceOptions, Toolbox
 from bavs_jax.uncertainty.models import MODELS
 from bavs_jax.uncertainty.models.laplace import laplace_variance
@@ -36,7 +33,7 @@ from bavs_jax.uncertainty.true_error import make_true_error_fn
 from experiments.build_field import field_background
 from experiments.build_scene import make_source
 from experiments.build_trainer import KINDS, build_trainer, calls_per_round, train_aside
-from experiments.errors import ConfigError, check_choice
+from experiments.errors import ConfigError
 
 RENDER_CHUNK = 4096  # rays of one compiled rendering call
 
@@ -62,34 +59,13 @@ class Problem(NamedTuple):
     num_devices: int  # that share the rays
 
 
-def check_choices(config) -> None:
-    """Raises ConfigError for an option that is not one of its choices."""
-    for name, kind in (("policies", str), ("seeds", int)):
-        values = config[name]
-        if not isinstance(values, tuple) or not all(isinstance(v, kind) for v in values):
-            raise ConfigError(
-                f"config.{name}: is {values!r}; give a tuple of {kind.__name__}, "
-                f"such as {(kind(1), kind(2))}"
-            )
-    options = config.uncertainty
-    for name, value, known in (
-        ("uncertainty.weighting", options.weighting, WEIGHTINGS),
-        ("uncertainty.variant", options.variant, VARIANTS),
-        ("uncertainty.scale", options.scale, SCALES),
-        ("uncertainty.extent", options.extent, EXTENTS),
-        ("candidates.source", config.candidates.source, ("dataset", "hemisphere")),
-        ("candidates.mode", config.candidates.mode, ("", *MODES)),
-    ):
-        check_choice(name, value, known)
-
-
 def build_problem(
     config, scene: Scene, kind: str = RECONSTRUCTION, mesh: Mesh | None = None
 ) -> Problem:
     """Puts fields, renderer, training, curvature and selection together.
 
     Args:
-      config: see `experiments/configs/base.py`.
+      config: see `experiments/configs/base.py`; `check_config` has seen it.
       scene: the scene.
       kind: of the field that the run trains and is measured on, one of `KINDS`.
       mesh: devices that share the work, from `make_mesh`.
@@ -97,7 +73,6 @@ def build_problem(
     Raises:
       ConfigError: an option that cannot be used.
     """
-    check_choices(config)
     check_shards(config, mesh)
     capacity = 8 * RENDER_CHUNK // num_shards(mesh)
     source, table = make_source(config, scene, make_pixel_table(scene))
@@ -106,7 +81,7 @@ def build_problem(
     trainer = trainers[kind]
     field, sampler = trainer.field, trainer.sampler
     background = field_background(scene)
-    laplace, grid = _laplace_options(config), _deformation_grid(config, scene)
+    laplace, grid = _laplace_options(config, scene), _deformation_grid(config, scene)
     group_size = curvature_group_size(grid.num_vertices, len(table.cameras))
 
     @cache
@@ -149,16 +124,17 @@ def build_problem(
         return fresh.replace(params=state.params, sampler_state=state.sampler_state)
 
     def make_toolbox(track: Callable) -> Toolbox:
-        def tracked_curvature(state, table, view_ids, within, label, *, weighting, by_view=False):
+        def tracked_curvature(state, rays, label, *, weighting, group_ids=None, **of_rays):
             quiet = contextlib.nullcontext(None)
-            with quiet if label is None else track(len(view_ids), label, "rays") as task:
+            with quiet if label is None else track(len(rays.origins), label, "rays") as task:
                 sums = curvature_fn(weighting)(
-                    *(state.params, state.sampler_state, table, view_ids, within),
+                    *(state.params, state.sampler_state, rays),
                     progress_fn=task and task.advance,
-                    group_ids=view_ids if by_view else None,
+                    group_ids=group_ids,
                     num_groups=group_size,  # in both cases, so that they share compilations
+                    **of_rays,
                 )
-            return sums if by_view else sums[0]
+            return sums[0] if group_ids is None else sums
 
         def train(kind, key, situation):
             return train_aside(config, trainers[kind], key, situation, kind, track)
@@ -217,7 +193,7 @@ def build_problem(
             centre=scene.centre,
             batch_size=config.batch_size,
             calls_per_round=calls_per_round(config),
-            num_rays=int(np.diff(scene.offsets)[np.asarray(initial)].sum()),
+            num_rays=int(num_training_pixels(scene, np.asarray(initial)).sum()),
             radii=_radii(config),
             mode=config.candidates.mode or None,
             label=label,
@@ -265,10 +241,11 @@ def _deformation_grid(config, scene: Scene) -> DeformationGrid:
     return DeformationGrid(jnp.asarray(scene.box), cells, contracted=scene.unbounded)
 
 
-def _laplace_options(config) -> LaplaceOptions:
+def _laplace_options(config, scene: Scene) -> LaplaceOptions:
     options = config.uncertainty
+    prior_weight = options.prior_weight or default_prior_weight(options.log2_cells)
     return LaplaceOptions(
-        prior_weight=options.prior_weight or default_prior_weight(options.log2_cells),
+        prior_weight=prior_weight / float(offset_unit(scene.box)) ** 2,
         weighting=options.weighting,
         variant=options.variant,
         scale=options.scale,
@@ -280,15 +257,4 @@ def _laplace_options(config) -> LaplaceOptions:
 
 def _radii(config) -> Radii | None:
     given = (config.candidates.min_train_distance, config.candidates.min_candidate_distance)
-    if given == (0.0, 0.0):
-        return None
-    if 0.0 in given:
-        raise ConfigError(
-            "config.candidates: give both min_train_distance and min_candidate_distance, or neither"
-        )
-    return Radii(*given)
-
-
-def run_key(seed: int) -> jax.Array:
-    """The key from which all of a run's randomness comes."""
-    return jax.random.key(seed)
+    return Radii(*given) if any(given) else None

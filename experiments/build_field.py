@@ -17,7 +17,7 @@ from bavs_jax.rendering.samplers import Sampler, make_occupancy_sampler
 from bavs_jax.rendering.sampling import make_march_options
 from bavs_jax.rendering.spacing import box_intervals, open_intervals
 from bavs_jax.scenes import Scene
-from experiments.errors import ConfigError, check_choice
+from experiments.errors import ConfigError
 
 # What can sample each kind of field; the first that suits the scene is the default.
 SAMPLERS = {
@@ -40,10 +40,9 @@ def build_field(
       learned_variance: whether the field also learns a variance of its colours.
 
     Raises:
-      ConfigError: an unknown kind, or kinds that do not go together.
+      ConfigError: kinds that do not go together.
     """
     field_kind = config.field_kind
-    check_choice("field_kind", field_kind, SAMPLERS)
     # An occupancy grid ends at the box.
     suitable = [k for k in SAMPLERS[field_kind] if not (scene.unbounded and k == "occupancy")]
     sampler_kind = config.sampler_kind or suitable[0]
@@ -94,7 +93,8 @@ def build_flow(config, scene: Scene) -> FlowField:
     """The distribution over fields that goes with a config's kind of field."""
     common = {"contracted": scene.unbounded, **config.flow}
     if config.field_kind == "hash_grid":
-        grid = {k: v for k, v in config.field.items() if k not in ("appearance_features", "initial_density")}
+        aside = ("appearance_features", "initial_optical_depth")
+        grid = {k: v for k, v in config.field.items() if k not in aside}
         return make_flow_field(scene.box, **grid, **common)
     trunk = config[config.field_kind]
     shape = {k: trunk[k] for k in ("depth", "width", "skip", "position_degree", "direction_degree")}
@@ -131,7 +131,12 @@ def _occupancy_sampler(options, scene: Scene) -> Sampler:
         num_steps=options.num_steps,
         num_slots=options.num_slots,
     )
-    return make_occupancy_sampler(scene.box, march_options, resolution=options.occupancy_resolution, distortion_weight=options.distortion_weight)
+    return make_occupancy_sampler(
+        scene.box,
+        march_options,
+        resolution=options.occupancy_resolution,
+        distortion_weight=options.distortion_weight,
+    )
 
 
 def _coarse_to_fine_sampler(config, scene: Scene) -> Sampler:

@@ -16,6 +16,9 @@ from bavs_jax.candidates import (
 from bavs_jax.scenes import Scene, SceneError, load_scene, sculpture
 from bavs_jax.scenes.procedural import capture
 from bavs_jax.training.batches import PixelTable
+from experiments.errors import ConfigError
+
+MAX_NEW_PIXELS = 1 << 30  # of pictures taken on the way, for which room is made at the start
 
 
 def load_config_scene(config, *, cache_dir: str | None) -> Scene:
@@ -58,6 +61,35 @@ def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:
             "give a number between 1 and that"
         )
     return np.random.default_rng(seed).permutation(np.asarray(scene.pool))[:num]
+
+
+def check_views(config, scene: Scene) -> None:
+    """Whether a scene has as many views as a config's rounds ask for, before any is trained.
+
+    Raises:
+      SceneError: the pool has fewer than `num_initial`.
+      ConfigError: it has fewer than all batches take, or a batch more than its candidates.
+    """
+    pool, batch, options = len(scene.pool), config.batch_size, config.candidates
+    left = pool - len(initial_views(scene, 0, config.num_initial))
+    taken = config.num_rounds * batch
+    drawn = options.source == "hemisphere"
+    if drawn and config.num_rounds and batch > options.hemisphere_draws:
+        raise ConfigError(
+            f"config.batch_size: is {batch}; give at most candidates.hemisphere_draws, "
+            f"{options.hemisphere_draws}"
+        )
+    if not (drawn and config.loader == "procedural"):
+        if taken > left:
+            raise ConfigError(
+                f"config.batch_size: {config.num_rounds} rounds of {batch} take {taken} views, but "
+                f"{scene.name} has {left} in the pool beside the initial ones; give fewer"
+            )
+    elif taken * int(np.diff(scene.offsets).max()) > MAX_NEW_PIXELS:
+        raise ConfigError(
+            f"config.batch_size: {config.num_rounds} rounds of {batch} take {taken} pictures, more "
+            f"than {MAX_NEW_PIXELS:,} pixels; give fewer, or a smaller image_size"
+        )
 
 
 def make_source(config, scene: Scene, table: PixelTable) -> tuple[CandidateSource, PixelTable]:

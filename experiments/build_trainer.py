@@ -23,6 +23,7 @@ from bavs_jax.training.objectives import (
 from bavs_jax.training.train import TrainState, init_train_state, make_optimiser, make_train_fn
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE, Situation
 from experiments.build_field import build_field, build_flow, field_background, learning_rate
+from experiments.errors import ConfigError
 
 
 class Trainer(NamedTuple):
@@ -49,10 +50,18 @@ def build_trainer(
       num_views: views of the pixel table.
       kind: one of `KINDS`.
       mesh: devices that share the rays and the sample buffer.
+
+    Raises:
+      ConfigError: options that do not go together.
     """
     field, sampler = build_field(config, scene, num_views, learned_variance=kind == VARIANCE)
     train, flow = config.train, None
     capacity = train.capacity // num_shards(mesh)
+    if not sampler.dense and capacity < sampler.num_slots:
+        raise ConfigError(
+            f"config.train.capacity: {capacity} samples of a device cannot hold the "
+            f"{sampler.num_slots} of one ray (config.march.num_slots): give more"
+        )
     rendering = {"capacity": capacity, "mesh": mesh}
     if kind == FLOW:
         flow = build_flow(config, scene)
@@ -70,7 +79,6 @@ def build_trainer(
         max_grad_norm=train.max_grad_norm,
         second_decay=train.adam_b2,
         epsilon=train.adam_eps,
-        levels_on=train.levels_on,
     )
     call = make_train_fn(
         field,

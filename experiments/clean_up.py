@@ -16,6 +16,7 @@ import time
 import numpy as np
 from absl import flags
 
+from bavs_jax.fields.deformation import offset_unit
 from bavs_jax.metrics.covered import MIN_OPACITY
 from bavs_jax.rendering.images import render_views
 from bavs_jax.uncertainty.cleanup import RULES, choose_threshold, spread_thresholds
@@ -47,7 +48,7 @@ def clean_up() -> None:
     script.check_flags(
         ("max_loss", FLAGS.max_loss >= 0.0, "give 0 dB or more"),
         ("keep", 0.0 < FLAGS.keep <= 1.0, "give a share above 0 and up to 1"),
-        ("num_thresholds", FLAGS.num_thresholds >= 3, "give 3 or more"),
+        ("num_thresholds", 3 <= FLAGS.num_thresholds <= 1000, "give a number from 3 to 1000"),
         ("min_opacity", 0.0 < FLAGS.min_opacity <= 1.0, "give an opacity above 0 and up to 1"),
         ("num_test", FLAGS.num_test >= 0, "give a count, or 0 for all"),
     )
@@ -65,7 +66,8 @@ def clean_run(run: TrainedRun) -> dict:
     """One run's numbers; writes its pictures."""
     start = time.monotonic()
     variance = run_variance(run, run_curvature(run))
-    thresholds = spread_thresholds(variance, FLAGS.num_thresholds)
+    unit = offset_unit(run.problem.scene.box)
+    thresholds = spread_thresholds(variance, FLAGS.num_thresholds, unit)
     cleaned = make_cleaned_chunk_fn(run, variance)
     test_views = spread_evenly(run.problem.scene.test, FLAGS.num_test)
     sweeps = {

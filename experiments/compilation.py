@@ -21,10 +21,10 @@ flags.DEFINE_string(
 def start_cache() -> None:
     """Does what the flags say; must come before anything is compiled."""
     if FLAGS.compilation_cache:
-        given = FLAGS.compilation_cache_dir
-        runtime.use_compilation_cache(
-            pathlib.Path(given) if given else runtime.cache_folder() / "compiled"
-        )
+        given, folder = FLAGS.compilation_cache_dir, runtime.cache_folder
+        root = runtime.usable_cache(pathlib.Path(given)) if given else folder()
+        if root is not None:
+            runtime.use_compilation_cache(root if given else root / "compiled")
 
 
 def as_flags() -> list[str]:

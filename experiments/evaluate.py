@@ -9,6 +9,7 @@ from bavs_jax.metrics.depth import depth_mae
 from bavs_jax.metrics.image import measure_images
 from bavs_jax.rendering.images import render_views
 from experiments.build import RENDER_CHUNK
+from experiments.picture_stack import stack_pictures
 from experiments.progress import track
 
 
@@ -89,6 +90,8 @@ def _measure(scene, view_id: int, image: dict, lpips_fn) -> dict[str, float]:
     truth = scene.image(view_id).astype(np.float32) / 255.0
     row = _measure_images(image["rgb"], truth, mask=mask, lpips_fn=lpips_fn)
     true_depth = scene.depth_image(view_id)
+    if true_depth is not None and mask is not None:
+        true_depth = np.where(mask, true_depth, 0.0)
     if true_depth is not None and (true_depth > 0).any():
         row["depth_mae"] = depth_mae(image["depth"], true_depth)
     return {k: float(v) for k, v in row.items() if v is not None}
@@ -101,16 +104,20 @@ def _mean(values) -> float | None:
 
 
 def picture_arrays(render_fn, scene, view_ids) -> dict[str, np.ndarray]:
-    """Truth, render, error, uncertainty and depth of some views, for the report."""
+    """Truth, render, error, uncertainty and depth of some views, for the report.
+
+    Views may differ in size: see `stack_pictures`, and `sizes` [n, 2] (width, height).
+    """
     images = render_views(render_fn, scene.cameras, view_ids, chunk=RENDER_CHUNK)
-    truth = np.stack([scene.image(v) for v in view_ids])
-    rgb = np.stack([np.clip(image["rgb"], 0.0, 1.0) for image in images])
+    truth = stack_pictures([scene.image(v) for v in view_ids])
+    rgb = stack_pictures([np.clip(image["rgb"], 0.0, 1.0) for image in images])
     return {
         "view_ids": np.asarray(view_ids),
         "names": np.array([scene.names[v] for v in view_ids]),
+        "sizes": np.asarray(scene.cameras.sizes)[view_ids],
         "truth": truth,
         "rgb": np.round(255.0 * rgb).astype(np.uint8),
         "error": np.abs(rgb - truth / 255.0).mean(-1).astype(np.float32),
-        "uncertainty": np.stack([image["uncertainty"] for image in images]),
-        "depth": np.stack([image["depth"] for image in images]),
+        "uncertainty": stack_pictures([image["uncertainty"] for image in images]),
+        "depth": stack_pictures([image["depth"] for image in images]),
     }

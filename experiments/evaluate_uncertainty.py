@@ -19,12 +19,11 @@ import time
 from absl import flags
 from ml_collections import config_flags
 
-from bavs_jax.uncertainty.conformal_scale import SCALES
-from bavs_jax.uncertainty.models import MODELS
 from experiments import compilation, runtime, workdir
 from experiments.build import build_problem
-from experiments.build_scene import load_config_scene
-from experiments.errors import USER_ERRORS, check_choice
+from experiments.build_scene import check_views, load_config_scene
+from experiments.errors import USER_ERRORS
+from experiments.schema import given_config
 from experiments.uncertain.one_seed import measure_seed
 from experiments.uncertain.summary import write_summary
 
@@ -42,14 +41,12 @@ flags.DEFINE_string("workdir", None, "Folder for fields, uncertainty.json and un
 
 def evaluate(config, folder: pathlib.Path, command: str) -> None:
     """All seeds, then the summary and the page."""
-    for name in config.evaluation.models:
-        check_choice("evaluation.models", name, tuple(MODELS))
-    check_choice("evaluation.interval_scale", config.evaluation.interval_scale, SCALES)
     start = time.monotonic()
-    folder.mkdir(parents=True, exist_ok=True)
-    workdir.claim(folder, config)
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    workdir.check_claim(folder, config)
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
+    check_views(config, scene)
     problem = build_problem(config, scene)
+    workdir.claim(folder, config)
     for seed in config.seeds:
         measure_seed(config, problem, folder, seed, command)
     numbers, page = write_summary(config, scene, folder, command)
@@ -58,13 +55,11 @@ def evaluate(config, folder: pathlib.Path, command: str) -> None:
 
 
 def main() -> None:
-    if FLAGS.config is None:
-        sys.exit("error: --config: is missing; try --config=experiments/configs/uncertainty.py")
-    if not FLAGS.workdir:
-        sys.exit("error: --workdir: is missing; name a folder for the results")
+    config = given_config("experiments/configs/uncertainty.py")
+    folder = runtime.given_folder("workdir", "a folder for the results")
     compilation.start_cache()
     try:
-        evaluate(FLAGS.config, pathlib.Path(FLAGS.workdir), runtime.command_line())
+        evaluate(config, folder, runtime.command_line())
     except USER_ERRORS as error:
         sys.exit(f"error: {error}")
 

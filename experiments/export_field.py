@@ -19,7 +19,6 @@ Needs `pip install 'bavs_jax[export]'`. For density, sigma and colour at points 
 
 from __future__ import annotations
 
-import math
 import pathlib
 import time
 
@@ -42,7 +41,7 @@ WHAT = ("grid", "points", "mesh")
 FLAGS = flags.FLAGS
 flags.adopt_module_key_flags(script)
 flags.DEFINE_list("what", list(WHAT), f"What to write, of {','.join(WHAT)}.")
-flags.DEFINE_integer("resolution", 128, "Grid points along the longest side of the scene box.")
+flags.DEFINE_integer("resolution", 128, "Grid points along the longest side of the box.")
 flags.DEFINE_float(
     "density_threshold",
     0.0,
@@ -61,16 +60,16 @@ def export() -> None:
     start = time.monotonic()
     script.check_flags(
         ("what", FLAGS.what and set(FLAGS.what) <= set(WHAT), f"give some of {','.join(WHAT)}"),
-        ("resolution", FLAGS.resolution >= 2, "give 2 or more"),
+        ("resolution", 2 <= FLAGS.resolution <= 1024, "give a number from 2 to 1024"),
         (
             "density_threshold",
-            FLAGS.density_threshold >= 0.0 and math.isfinite(FLAGS.density_threshold),
+            0.0 <= FLAGS.density_threshold <= 1e9,
             "give a number above 0, or 0 for the default",
         ),
         ("min_part", 0.0 <= FLAGS.min_part < 1.0, "give a share from 0 up to below 1"),
         ("min_opacity", 0.0 < FLAGS.min_opacity <= 1.0, "give a share above 0 and up to 1"),
-        ("max_points", FLAGS.max_points >= 0, "give a number above 0, or 0 for all"),
-        ("num_samples", FLAGS.num_samples >= 1, "give 1 or more"),
+        ("max_points", 0 <= FLAGS.max_points <= 10**9, "give a number above 0, or 0 for all"),
+        ("num_samples", 1 <= FLAGS.num_samples <= 10**7, "give a number from 1 to 10 million"),
     )
     field_files.check_libraries(FLAGS.what)
     for run in script.trained_runs():
@@ -89,7 +88,7 @@ def export_run(run: TrainedRun) -> dict[str, pathlib.Path]:
     if "grid" in FLAGS.what:
         files |= field_files.write_grid(folder, scene, axes, grid)
         files["slices"] = folder / "slices.png"
-        save_figure(slices_figure(axes, grid), files["slices"])
+        save_figure(slices_figure(axes, grid, scene.box), files["slices"])
     if "points" in FLAGS.what:
         files |= field_files.write_points(
             folder,

@@ -8,7 +8,6 @@ with their uncertainty (Figure 8: views.pdf), from the result files alone.
 
 from __future__ import annotations
 
-import pathlib
 import sys
 
 from absl import flags
@@ -27,11 +26,10 @@ flags.DEFINE_integer(
 
 
 def main() -> None:
-    if not FLAGS.workdir:
-        sys.exit("error: --workdir: is missing; name the folder of an experiment")
+    folder = runtime.given_folder("workdir", "the folder of an experiment", exists=True)
     options = {"form": FLAGS.format, "policies": FLAGS.policy, "num_views": FLAGS.num_views}
     try:
-        for path in write_figures(pathlib.Path(FLAGS.workdir), **options):
+        for path in write_figures(folder, **options):
             print(path)
     except ReportError as error:
         sys.exit(f"error: {error}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import json
 import os
@@ -11,13 +12,18 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from experiments.errors import WorkdirError
 from experiments.processes import is_first_process
+from experiments.runtime import warn
 
 
 def write_atomic(path: str | os.PathLike, write_fn: Callable) -> None:
     """Calls `write_fn(file)` on a temporary binary file beside `path`, then renames it.
 
     Of several processes that work together, the first one writes; so it is everywhere here.
+
+    Raises:
+      WorkdirError: it cannot be written, such as to a full disk.
     """
     if not is_first_process():
         return
@@ -27,10 +33,16 @@ def write_atomic(path: str | os.PathLike, write_fn: Callable) -> None:
     try:
         with open(temporary, "wb") as file:
             write_fn(file)
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except OSError as error:
+        raise WorkdirError(
+            f"{path}: cannot be written ({error.strerror or error}): make room there, then start "
+            "again"
+        ) from error
+    finally:
         temporary.unlink(missing_ok=True)
-        raise
 
 
 def write_json(path: str | os.PathLike, value) -> None:
@@ -48,11 +60,71 @@ def append_line(path: str | os.PathLike, value: dict) -> None:
     """One JSON object as a line at the end of a file that several processes may write to."""
     if not is_first_process():
         return
-    line = json.dumps(value, allow_nan=False) + "\n"
-    with open(path, "ab", buffering=0) as file:
-        # The lock is for folders that machines share: only there may two lines overlap.
-        fcntl.flock(file, fcntl.LOCK_EX)
-        file.write(line.encode())
+    line = (json.dumps(value, allow_nan=False) + "\n").encode()
+    try:
+        with open(path, "ab+", buffering=0) as file:
+            # The lock is for folders that machines share: only there may two lines overlap.
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if file.seek(0, os.SEEK_END) and os.pread(file.fileno(), 1, file.tell() - 1) != b"\n":
+                line = b"\n" + line  # what was being written when a process was killed
+            if file.write(line) < len(line):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    except OSError as error:
+        raise WorkdirError(
+            f"{path}: cannot be written ({error.strerror}): make room there, then start again"
+        ) from error
+
+
+def read_json(path: str | os.PathLike, otherwise: str = "made again") -> dict | None:
+    """What `write_json` has written; None where there is nothing or, after a warning, a damaged
+    file.
+
+    Args:
+      path: of the file.
+      otherwise: what is done about a damaged one.
+    """
+    try:
+        value = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
+        if isinstance(value, dict):
+            return value
+        reason = "not a JSON object"
+    except FileNotFoundError:
+        return None
+    except (ValueError, RecursionError) as error:
+        reason = f"not JSON: {error}"
+    warn(f"{path}: damaged ({reason}): {otherwise}")
+    return None
+
+
+def read_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray] | None:
+    """What `write_arrays` has written, with some names; None as in `read_json`."""
+    try:
+        return load_arrays(path, *names)
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        warn(f"{error}: made again")
+        return None
+
+
+def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
+    """The arrays of an `.npz`.
+
+    Raises:
+      FileNotFoundError: there is no file.
+      ValueError: it is damaged or lacks one of `names`; names the file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise
+    # Of zip, zlib, the header's tokens and the size it claims, damage may break any.
+    except Exception as error:
+        raise ValueError(f"{path}: damaged ({' '.join(str(error).split())})") from error
+    if missing := [name for name in names if name not in arrays]:
+        raise ValueError(f"{path}: lacks {', '.join(missing)}")
+    return arrays
 
 
 @contextlib.contextmanager

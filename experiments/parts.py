@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import pathlib
 from typing import NamedTuple
 
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.uncertainty.model import RECONSTRUCTION
 from experiments.errors import ConfigError
+from experiments.files import read_arrays, read_json
 
 
 class Part(NamedTuple):
@@ -51,9 +51,19 @@ def find_part(name: str, parts: list[Part]) -> Part:
 
 
 def is_finished(workdir: pathlib.Path, part: Part) -> bool:
-    """Whether all files of a part are written."""
+    """Whether all files of a part are written, and none is damaged."""
     folder = workdir / part.name
     if part.policy is None:
-        return (folder / "round_0.json").exists()
-    path = folder / "result.json"
-    return path.exists() and json.loads(path.read_text(encoding="utf-8"))["completed"]
+        return read_json(folder / "round_0.json") is not None
+    pictures = folder / "pictures.npz"  # of the first seed only
+    return (
+        is_completed(read_json(folder / "result.json"))
+        and read_json(folder / "next_views" / "transforms.json") is not None
+        and read_arrays(folder / "acquisition.npz") is not None
+        and (not pictures.exists() or read_arrays(pictures) is not None)
+    )
+
+
+def is_completed(result: dict | None) -> bool:
+    """Whether a result file is there, and of a run that has come to its end."""
+    return result is not None and bool(result.get("completed"))

@@ -52,10 +52,10 @@ def draw_all() -> None:
     """Draws, renders, measures and writes, run by run."""
     start = time.monotonic()
     script.check_flags(
-        ("num_draws", FLAGS.num_draws >= 2, "give 2 or more"),
+        ("num_draws", 2 <= FLAGS.num_draws <= 1024, "give a number from 2 to 1024"),
         ("num_views", FLAGS.num_views >= 1, "give 1 or more"),
-        ("scale", FLAGS.scale >= 0.0, "give a number above 0, or 0 for the noise's own"),
-        ("limit", FLAGS.limit > 0.0, "give a number above 0"),
+        ("scale", 0.0 <= FLAGS.scale <= 1e9, "give a number above 0, or 0 for the noise's own"),
+        ("limit", 0.0 < FLAGS.limit <= 1e6, "give a number above 0, up to 1e6"),
     )
     rows = []
     for run in script.trained_runs():

@@ -36,7 +36,7 @@ def main() -> None:
     if not FLAGS.workdir:
         sys.exit("error: --workdir: is missing; name the folder of a finished experiment")
     folders = [pathlib.Path(folder) for folder in FLAGS.workdir]
-    out = pathlib.Path(FLAGS.out) if FLAGS.out else folders[0]
+    out = runtime.given_folder("out", "a folder for the results") if FLAGS.out else folders[0]
     compilation.start_cache()
     try:
         result = compare(

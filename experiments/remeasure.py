@@ -9,7 +9,6 @@ files of another scene are noticed. What has been measured by the same network i
 
 from __future__ import annotations
 
-import pathlib
 import sys
 
 from absl import flags
@@ -29,12 +28,11 @@ flags.DEFINE_string("data_dir", "", "Folder of scenes, if it has moved since the
 
 
 def main() -> None:
-    if not FLAGS.workdir:
-        sys.exit("error: --workdir: is missing; name the folder of an experiment")
+    folder = runtime.given_folder("workdir", "the folder of an experiment", exists=True)
     compilation.start_cache()
     try:
         wanted = Wanted(FLAGS.lpips_net, FLAGS.policy, FLAGS.data_dir)
-        remeasure(pathlib.Path(FLAGS.workdir), wanted, runtime.command_line())
+        remeasure(folder, wanted, runtime.command_line())
     except (*USER_ERRORS, ReportError) as error:
         sys.exit(f"error: {error}")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import pathlib
 import time
 from functools import partial
@@ -13,20 +12,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.active import ActiveState, Choice, init_active_state
+from bavs_jax.training.batches import num_training_pixels
 from bavs_jax.training.checkpoints import Checkpoints
 from bavs_jax.uncertainty.model import Situation
 from experiments import acquisitions
 from experiments.baselines import measure_baselines
-from experiments.build import Problem, run_key
+from experiments.build import Problem
 from experiments.build_scene import initial_views
+from experiments.errors import WorkdirError
 from experiments.evaluate import measure_test_views, picture_arrays, spread_evenly
-from experiments.files import append_line, write_arrays, write_json
+from experiments.files import append_line, read_json, write_arrays, write_json
+from experiments.keys import run_key, stream_key
 from experiments.machine import device_name, peak_memory_mb, versions
-from experiments.parts import Part
+from experiments.parts import Part, is_completed, is_finished
 from experiments.predicted.cases import realised_gain
 from experiments.processes import as_first_process, is_first_process
 from experiments.progress import track
 from experiments.report.choices import bound_words
+from experiments.runtime import warn
 
 SCHEMA_VERSION = 1
 LOG_EVERY = 10  # training calls between two lines of metrics.jsonl
@@ -44,11 +47,13 @@ class Run:
         self.command = command
         self.policy, self.seed = policy, seed
         self.label = f"{policy or 'initial'} seed {seed}"
-        self.folder = workdir / Part(policy, problem.kind, seed).name
+        self.part = Part(policy, problem.kind, seed)
+        self.folder = workdir / self.part.name
         self.initial = initial_views(problem.scene, seed, config.num_initial)
         self.rounds: list[dict] = []  # of result.json
         self.pending = _new_pending()  # what is known of the round under way
-        self.checkpoints = Checkpoints(self.folder / "checkpoints")
+        self._is_restored = False  # whether a checkpoint was there
+        self.checkpoints = Checkpoints(self.folder / "checkpoints", warn_fn=warn)
 
     def finish(self, shared: Run | None = None) -> None:
         """Goes on from the last checkpoint to the last round and writes all files of the run.
@@ -57,6 +62,8 @@ class Run:
           shared: the finished run of round 0 to start from; None to make round 0 here.
         """
         state = self._start(shared)
+        if self.policy and not is_finished(self.workdir, self.part):
+            acquisitions.load_choices(self.folder, int(state.round))  # whether they can be read
         step = self.problem.make_step(
             self.policy or self.config.policies[0], self.initial, track, self.label
         )
@@ -75,8 +82,17 @@ class Run:
         self.checkpoints.close()
 
     def state(self) -> ActiveState:
-        """The state of the last checkpoint, or a fresh one."""
-        return self._start(None)
+        """The state of the last checkpoint.
+
+        Raises:
+          WorkdirError: there is none that can be read.
+        """
+        state = self._start(None)
+        if not self._is_restored:
+            raise WorkdirError(
+                f"{self.folder}: holds no checkpoint that can be read: start its run again"
+            )
+        return state
 
     # --- one round ---
 
@@ -161,27 +177,29 @@ class Run:
 
     def _uncertain_render_fn(self, state: ActiveState):
         """Renders colour and uncertainty (Fig 4) of a state that may come from disk."""
-        num_rays = int(np.diff(self.problem.scene.offsets)[self.initial].sum())
+        num_rays = int(num_training_pixels(self.problem.scene, self.initial).sum())
         fns = self.problem.model_fns("laplace", track)
         situation = Situation(
             *(state.train, state.table, state.is_training_view, num_rays),
             label=f"{self.label}: pictures",
         )
-        fitted = fns.fit(jax.random.fold_in(run_key(self.seed), 2**31 - 2), situation)
+        fitted = fns.fit(stream_key(self.seed, "pictures"), situation)
         return partial(fns.render, fitted, state.train)
 
     # --- files ---
 
     def _start(self, shared: Run | None) -> ActiveState:
         """The last checkpoint's state, or the one where `shared` ended, or a fresh one."""
-        init_key = jax.random.fold_in(run_key(self.seed), 2**31 - 1)
+        init_key = stream_key(self.seed, "init")
         fresh = init_active_state(
             self.problem.init_train(init_key), self.problem.table, self.initial
         )
         for run in (self, shared):
-            if run is not None and run.checkpoints.latest() is not None:
-                saved, meta = run.checkpoints.restore(saved_part(self.problem, fresh))
+            found = run and run.checkpoints.restore(saved_part(self.problem, fresh))
+            if found:
+                saved, meta = found
                 self.rounds, self.pending = meta["rounds"], meta["pending"]
+                self._is_restored = True
                 return whole_state(self.problem, saved)
         return fresh
 
@@ -193,14 +211,14 @@ class Run:
         self.checkpoints.save(number, saved_part(self.problem, state), meta)
 
     def _write_files(self, state: ActiveState, *, completed: bool) -> None:
-        path = self.folder / "result.json"
-        if path.exists() and json.loads(path.read_text(encoding="utf-8"))["completed"]:
+        if is_finished(self.workdir, self.part):
             return
         scene, config = self.problem.scene, self.config
-        if completed and self.seed == config.seeds[0]:
+        path, pictures_path = self.folder / "result.json", self.folder / "pictures.npz"
+        if completed and (self.seed == config.seeds[0] or pictures_path.exists()):
             view_ids = spread_evenly(scene.test, config.num_pictures)
             pictures = picture_arrays(self._uncertain_render_fn(state), scene, view_ids)
-            write_arrays(self.folder / "pictures.npz", **pictures, round=int(state.round))
+            write_arrays(pictures_path, **pictures, round=int(state.round))
         if not is_first_process():
             return
         choices = acquisitions.load_choices(self.folder, int(state.round))
@@ -212,7 +230,8 @@ class Run:
             acquisitions.write_next_views(
                 self.folder / "next_views" / "transforms.json", scene, choices
             )
-        write_json(path, self._result(completed))
+        if not is_completed(read_json(path)):  # measured since, if it is
+            write_json(path, self._result(completed))
 
     def _result(self, completed: bool) -> dict:
         scene = self.problem.scene

@@ -16,31 +16,35 @@ import time
 from absl import flags
 from ml_collections import config_flags
 
-from bavs_jax.scenes import load_scene
+from bavs_jax.scenes import LOADERS, load_scene
+from bavs_jax.scenes.pose_files import read_pose_file
 from experiments import compilation, runtime, workdir
 from experiments.build import build_problem
 from experiments.errors import USER_ERRORS
+from experiments.schema import MAX_SEED, MAX_WIDTH, check_config
 from experiments.suggest import choosing, places, results, settings, training
 
 FLAGS = flags.FLAGS
 flags.adopt_module_key_flags(compilation)
 flags.DEFINE_string("data", None, "Folder of the capture, in any layout that can be loaded.")
 flags.DEFINE_string("workdir", None, "Folder for poses, checkpoints and report.html.")
-flags.DEFINE_integer("num_views", 10, "How many poses to propose.")
+flags.DEFINE_integer("num_views", 10, "How many poses to propose.", 1, settings.MAX_POSES)
 flags.DEFINE_string("policy", "bavs_spread", "Acquisition policy that chooses.")
-flags.DEFINE_integer("holdout", 0, "Photos left out of training, to measure the field on.")
-flags.DEFINE_string("loader", "auto", "Layout of the folder; auto: by the files in it.")
-flags.DEFINE_integer("image_size", 135, "Width in pixels to which the widest photo is reduced.")
-flags.DEFINE_integer("train_steps", 2400, "Optimiser steps of the field.")
+flags.DEFINE_integer("holdout", 0, "Photos left out of training, to measure the field on.", 0)
+flags.DEFINE_enum("loader", "auto", [*LOADERS, "auto"], "Layout of the folder; auto: by its files.")
+flags.DEFINE_integer(
+    "image_size", 135, "Width in pixels to which the widest photo is reduced.", 1, MAX_WIDTH
+)
+flags.DEFINE_integer("train_steps", 2400, "Optimiser steps of the field.", 1)
 config_flags.DEFINE_config_dict(
     "config",
     settings.default_config(),
     "Every other option of the field and its uncertainty, as --config.name=value; they are "
     "explained in experiments/configs/base.py.",
 )
-flags.DEFINE_integer("seed", 0, "Of everything that is drawn.")
+flags.DEFINE_integer("seed", 0, "Of everything that is drawn.", 0, MAX_SEED)
 flags.DEFINE_enum("candidates", "shell", settings.KINDS, "Where a camera could stand.")
-flags.DEFINE_integer("num_candidates", 150, "Poses to choose from.")
+flags.DEFINE_integer("num_candidates", 150, "Poses to choose from.", 1, settings.MAX_POSES)
 flags.DEFINE_string("bounds", "", "x0,y0,z0,x1,y1,z1 in user coordinates; no pose is outside.")
 flags.DEFINE_string("poses_file", "", "JSON or CSV of reachable poses, for --candidates=file.")
 flags.DEFINE_float("clearance", 0.0, "Free radius around a camera in user units; 0: 5 %.")
@@ -55,7 +59,7 @@ def read_options() -> settings.Options:
     """The flags as options, checked.
 
     Raises:
-      PlacementError: a value that cannot be used.
+      PlacementError, SelectionError, SceneError: a value or a file that cannot be used.
     """
     options = settings.Options(
         num_views=FLAGS.num_views,
@@ -73,26 +77,39 @@ def read_options() -> settings.Options:
         seed=FLAGS.seed,
     )
     settings.check_options(options)
+    if options.poses_file:
+        read_pose_file(options.poses_file)  # what is wrong there shows before anything is trained
     choosing.check_policy(options.policy)
     return options
 
 
-def suggest_views(data: pathlib.Path, folder: pathlib.Path, options: settings.Options) -> None:
-    """Trains, proposes, chooses and writes."""
-    begin = time.monotonic()
+def read_config(data: pathlib.Path):
+    """The config with what flags of their own say, checked.
+
+    Raises:
+      ConfigError: an option that cannot be used.
+    """
     config = FLAGS.config
     config.loader, config.image_size = FLAGS.loader, FLAGS.image_size
     config.holdout, config.train.num_steps = FLAGS.holdout, FLAGS.train_steps
     config.candidates.image_scale = FLAGS.score_scale
     settings.name_scene(config, data)
+    return check_config(config, "holdout")
+
+
+def suggest_views(
+    config, data: pathlib.Path, folder: pathlib.Path, options: settings.Options
+) -> None:
+    """Trains, proposes, chooses and writes."""
+    begin = time.monotonic()
+    workdir.check_claim(folder, config)
     scene = load_scene(FLAGS.loader, root=data, image_size=FLAGS.image_size)
     scene = training.all_for_training(scene, FLAGS.holdout)
-    folder.mkdir(parents=True, exist_ok=True)
-    workdir.claim(folder, config)
     around = places.look_around(scene, options)
     print(f"{scene.name}: {len(scene.pool)} photos to train on, {len(scene.test)} left out")
 
     problem = build_problem(config, scene)
+    workdir.claim(folder, config)
     field_folder = folder / "field" / f"seed_{options.seed}"
     train = training.train_field(config, problem, field_folder, options.seed)
     jac_sq_sum = training.photo_curvature(problem, train, field_folder, options.seed)
@@ -134,12 +151,12 @@ def suggest_views(data: pathlib.Path, folder: pathlib.Path, options: settings.Op
 
 
 def main() -> None:
-    for name, hint in (("data", "folder of the capture"), ("workdir", "folder for the results")):
-        if not FLAGS[name].value:
-            sys.exit(f"error: --{name}: is missing; name a {hint}")
-    compilation.start_cache()
+    data = runtime.given_folder("data", "the folder of the capture", exists=True)
+    folder = runtime.given_folder("workdir", "a folder for the results")
     try:
-        suggest_views(pathlib.Path(FLAGS.data), pathlib.Path(FLAGS.workdir), read_options())
+        options, config = read_options(), read_config(data)
+        compilation.start_cache()
+        suggest_views(config, data, folder, options)
     except USER_ERRORS as error:
         sys.exit(f"error: {error}")
 

@@ -12,16 +12,15 @@ ablations do. Started again, a sweep goes on: what is finished is not run again.
 from __future__ import annotations
 
 import pathlib
-import signal
 import sys
 
 from absl import flags
 from ml_collections import config_flags
 
 from experiments import compilation, runtime, workdir
-from experiments.build import check_choices
 from experiments.errors import USER_ERRORS
 from experiments.report import ReportError, write_report
+from experiments.schema import check_config, given_config
 from experiments.sweeps import capacity
 from experiments.sweeps.axes import parse_axes
 from experiments.sweeps.local import LocalEngine
@@ -72,8 +71,9 @@ def make_engine() -> Engine:
 def claim_folders(settings: list[Setting], folder: pathlib.Path) -> Record:
     """Checks every setting before anything is run, and notes what the sweep is made of."""
     for setting in settings:
-        check_choices(setting.config)
-        setting.folder.mkdir(parents=True, exist_ok=True)
+        check_config(setting.config)
+        workdir.check_claim(setting.folder, setting.config)
+    for setting in settings:
         workdir.claim(setting.folder, setting.config)
     rows = [
         {
@@ -118,21 +118,15 @@ def sweep(config, folder: pathlib.Path, given: list[str]) -> int:
 
 
 def main() -> None:
-    if FLAGS.config is None:
-        sys.exit("error: --config: is missing; try --config=experiments/configs/quickstart.py")
-    if not FLAGS.workdir:
-        sys.exit("error: --workdir: is missing; name a folder for the results")
+    config = given_config("experiments/configs/quickstart.py")
+    folder = runtime.given_folder("workdir", "a folder for the results")
     flag = FLAGS["config"]
     given = [f"--config={config_flags.get_config_filename(flag)}"]
     given += [option_flag(*item) for item in config_flags.get_override_values(flag).items()]
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        failed = sweep(FLAGS.config, pathlib.Path(FLAGS.workdir), given)
+        failed = sweep(config, folder, given)
     except (*USER_ERRORS, ReportError, OSError) as error:
         sys.exit(f"error: {' '.join(str(error).split())}")
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        sys.exit(128 + signal.SIGINT)
     if failed:
         sys.exit(f"error: {failed} trial{'s' if failed > 1 else ''} failed; reasons are above")
 

@@ -92,7 +92,8 @@ def main() -> None:
         sys.exit("error: give either --workdir or --page")
     try:
         if FLAGS.workdir:
-            folder, names = pathlib.Path(FLAGS.workdir), FLAGS.tables
+            folder = runtime.given_folder("workdir", "the folder of an experiment", exists=True)
+            names = FLAGS.tables
             options = {"names": names, "paper": FLAGS.paper, "only": FLAGS.policies or ()}
             print(result_tables(folder, form=FLAGS.format, **options))
             return

@@ -28,10 +28,11 @@ from experiments.bench.quality import first_seconds, measure_run, parse_targets
 from experiments.bench.results import QUALITY, quality_tables
 from experiments.build_scene import load_config_scene
 from experiments.configs import base
-from experiments.errors import USER_ERRORS
+from experiments.errors import USER_ERRORS, ConfigError
 from experiments.files import write_json
 from experiments.machine import versions
 from experiments.report.collected import collected_text
+from experiments.schema import given_config
 
 FLAGS = flags.FLAGS
 config_flags.DEFINE_config_file(
@@ -42,9 +43,9 @@ config_flags.DEFINE_config_file(
     lock_config=True,
 )
 flags.DEFINE_string("workdir", None, "Folder for time_to_quality.json and its page.")
-flags.DEFINE_integer("num_views", 20, "Training views.")
-flags.DEFINE_integer("num_test_views", 25, "Test views, evenly spaced.")
-flags.DEFINE_integer("every", 128, "Optimiser steps between two looks at the test views.")
+flags.DEFINE_integer("num_views", 20, "Training views.", 1)
+flags.DEFINE_integer("num_test_views", 25, "Test views, evenly spaced; 0: all.", 0)
+flags.DEFINE_integer("every", 128, "Optimiser steps between two looks at the test views.", 1)
 flags.DEFINE_list("targets", ["25", "28", "30"], "PSNR in dB, the smallest first.")
 PREPARE, CACHES = "prepare", ("cold", "warm")
 flags.DEFINE_enum("part", None, (PREPARE, *CACHES), "Set by the script itself: a part of its work.")
@@ -56,12 +57,14 @@ SCHEMA_VERSION = 1
 def start_process(folder: pathlib.Path, part: str) -> dict | None:
     """One part in a process of its own; what it wrote, if anything.
 
-    This process never touches the device, which a second one might not be able to share.
+    This process never touches the device, which a second one might not be able to share. Ctrl-C
+    reaches this one only, which ends the other.
     """
     command = [sys.executable, "-m", "experiments.time_to_quality", *sys.argv[1:]]
     path = folder / f"{part}.json"
     path.unlink(missing_ok=True)
-    done = subprocess.run([*command, f"--part={part}", f"--started={time.time()!r}"], check=False)
+    command += [f"--part={part}", f"--started={time.time()!r}"]
+    done = subprocess.run(command, check=False, start_new_session=True)
     if done.returncode:
         sys.exit(done.returncode)
     if not path.exists():
@@ -74,7 +77,7 @@ def start_process(folder: pathlib.Path, part: str) -> dict | None:
 def run_part(config, folder: pathlib.Path, part: str, targets: list[str]) -> None:
     """What a process that `start_process` has started does."""
     if part == PREPARE:
-        load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+        load_config_scene(config, cache_dir=runtime.scene_cache())
         return
     print(f"{part} compilation cache:", flush=True)
     runtime.use_compilation_cache(folder / "compiled")
@@ -119,9 +122,9 @@ def compare_caches(config, folder: pathlib.Path, command: str) -> None:
 
 
 def main() -> None:
-    if not FLAGS.workdir:
-        sys.exit("error: --workdir: is missing; name a folder for the results")
-    config, folder = FLAGS.config, pathlib.Path(FLAGS.workdir)
+    config, folder = given_config(), runtime.given_folder("workdir", "a folder for the results")
+    if (FLAGS.part in CACHES) != (FLAGS.started is not None):
+        raise ConfigError("--part and --started: are set by the script itself; leave them out")
     config.lpips_net = ""
     try:
         targets = parse_targets(FLAGS.targets)

@@ -12,15 +12,18 @@ from ml_collections import ConfigDict
 
 from bavs_jax.active import ActiveState
 from bavs_jax.selection.policies import POLICIES, get_policy
+from bavs_jax.training.batches import num_training_pixels
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation, Toolbox
 from bavs_jax.uncertainty.models.laplace import laplace_variance, training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
-from experiments.build import Problem, run_key
+from experiments.build import Problem
 from experiments.build_trainer import KINDS
 from experiments.configs import base
 from experiments.errors import WorkdirError
+from experiments.keys import stream_key
 from experiments.progress import track
 from experiments.runner import Run
+from experiments.schema import check_config
 
 FIRST_ROUND = "initial"  # folder of round 0, which all policies of a seed share
 
@@ -93,10 +96,10 @@ def saved_config(workdir: pathlib.Path) -> ConfigDict:
         raise WorkdirError(
             f"{path}: does not exist: give the --workdir of a run, or a --config to start one"
         ) from error
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise WorkdirError(f"{path}: cannot be read ({reason}): start the run again") from error
-    return config
+    return check_config(config, name=str(path))
 
 
 def find_runs(workdir: pathlib.Path) -> list[tuple[str, int]]:
@@ -159,7 +162,7 @@ def load_run(config, problem: Problem, workdir: pathlib.Path, policy: str, seed:
         config=config,
         problem=problem,
         state=state,
-        num_rays=int(np.diff(problem.scene.offsets)[run.initial].sum()),
+        num_rays=int(num_training_pixels(problem.scene, run.initial).sum()),
         folder=run.folder,
         policy=policy,
         seed=seed,
@@ -190,7 +193,7 @@ def train_run(
 def run_curvature(run: TrainedRun) -> jax.Array:
     """`jac_sq_sum` [G, 3] of the training rays, with progress."""
     # The key of the run's own pictures, so that the same uncertainty comes out.
-    key = jax.random.fold_in(run_key(run.seed), 2**31 - 2)
+    key = stream_key(run.seed, "pictures")
     toolbox = run.toolbox
     return training_curvature(key, toolbox, run.situation, toolbox.laplace.weighting)
 

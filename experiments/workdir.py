@@ -6,7 +6,8 @@ import json
 import pathlib
 
 from experiments.errors import WorkdirError
-from experiments.files import write_atomic, write_json
+from experiments.files import read_json, write_atomic, write_json
+from experiments.runtime import warn
 
 SUMMARY_VERSION = 1
 # What may differ when a folder is taken up again: more policies or seeds add runs.
@@ -16,23 +17,48 @@ EXTENSIBLE = (
 )
 
 
-def claim(workdir: pathlib.Path, config) -> None:
-    """Writes `config.json`, or checks that an earlier run of this folder had the same config.
+def check_claim(workdir: pathlib.Path, config) -> None:
+    """Checks that what was made in a folder was made with the same config; writes nothing.
 
     Raises:
-      WorkdirError: the folder holds a run of another config.
+      WorkdirError: it holds a run of another config, or of one that cannot be read.
     """
     path = workdir / "config.json"
-    values = json.loads(json.dumps(config.to_dict()))
-    if path.exists():
-        before = json.loads(path.read_text(encoding="utf-8"))
-        for field in sorted(_leaves(before).items() ^ _leaves(values).items()):
-            if field[0] not in EXTENSIBLE:
-                raise WorkdirError(
-                    f"{path}: {field[0]}: differs from the run that is there; "
-                    "use another --workdir or the same config"
-                )
-    write_json(path, values)
+    if not path.exists() or not _holds_work(workdir):
+        return
+    before = read_json(path, otherwise="")
+    if before is None:
+        raise WorkdirError(
+            f"{path}: damaged: delete it if the runs there are of this config, and start again; "
+            "or use another --workdir"
+        )
+    for field in sorted(_leaves(before).items() ^ _leaves(_as_json(config)).items()):
+        if field[0] not in EXTENSIBLE:
+            raise WorkdirError(
+                f"{path}: {field[0]}: differs from the run that is there; "
+                "use another --workdir or the same config"
+            )
+
+
+def claim(workdir: pathlib.Path, config) -> None:
+    """Makes a folder and its `config.json`; to be called when all else has been checked.
+
+    Raises:
+      WorkdirError: see `check_claim`.
+    """
+    check_claim(workdir, config)
+    workdir.mkdir(parents=True, exist_ok=True)
+    write_json(workdir / "config.json", _as_json(config))
+
+
+def _as_json(config) -> dict:
+    return json.loads(json.dumps(config.to_dict()))
+
+
+def _holds_work(workdir: pathlib.Path) -> bool:
+    """Whether anything is there that a config has made."""
+    numbers = (path.name for path in workdir.glob("*/seed_*/checkpoints/*"))
+    return any(map(str.isdigit, numbers)) or any(workdir.glob("*/seed_*/result.json"))
 
 
 def _leaves(values: dict, prefix: str = "") -> dict[str, str]:
@@ -48,15 +74,20 @@ def _leaves(values: dict, prefix: str = "") -> dict[str, str]:
 
 def collect(workdir: pathlib.Path) -> dict:
     """Collects all `<policy>/seed_<n>/result.json` into `summary.json`."""
-    paths = sorted(workdir.glob("*/seed_*/result.json"), key=_run_order)
-    runs = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
-    summary = {"schema_version": SUMMARY_VERSION, "runs": runs}
+    paths = []
+    for path in workdir.glob("*/seed_*/result.json"):
+        policy, seed = path.parts[-3], path.parts[-2].removeprefix("seed_")
+        if seed.isdecimal():
+            paths.append((policy, int(seed), path))
+        else:
+            warn(f"{path.parent}: not seed_<number>: left out of summary.json")
+    results = [
+        read_json(path, otherwise="left out of summary.json until its run is started again")
+        for _, _, path in sorted(paths)
+    ]
+    summary = {"schema_version": SUMMARY_VERSION, "runs": [r for r in results if r is not None]}
     write_json(workdir / "summary.json", summary)
     return summary
-
-
-def _run_order(path: pathlib.Path):
-    return path.parent.parent.name, int(path.parent.name.removeprefix("seed_"))
 
 
 def export_next_views(workdir: pathlib.Path, policy: str, seed: int) -> pathlib.Path:

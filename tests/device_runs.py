@@ -33,7 +33,7 @@ from bavs_jax.training.train import init_train_state, make_train_fn
 from bavs_jax.uncertainty.channel import vertex_variance
 from bavs_jax.uncertainty.predictive import make_predictive_fn
 from bavs_jax.uncertainty.scoring import make_render_chunk_fn, mean_uncertainty
-from bavs_jax.uncertainty.streaming import make_curvature_fn, training_pixels
+from bavs_jax.uncertainty.streaming import make_curvature_fn, table_rays, training_pixels
 from tests.toy_scenes import toy_scene
 
 NUM_RAYS, CAPACITY, CHUNK = 64, 4096, 128
@@ -102,7 +102,8 @@ def main(out):
         field, sampler, grid, background=scene.background, chunk_samples=256, mesh=mesh
     )
     trained = train_state.params, train_state.sampler_state
-    curvature = curvature_fn(*trained, table, *training_pixels(table, mask))[0]
+    pixels = table_rays(table, *training_pixels(table, mask), "eq13")
+    curvature = curvature_fn(*trained, **pixels)[0]
     found["curvature"] = np.asarray(curvature)
     variance = vertex_variance(
         curvature, num_rays=100, prior_weight=1e-4, weighting="eq13", variant="posterior"

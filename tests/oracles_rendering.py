@@ -49,11 +49,25 @@ def march_loop(origin, direction, occupied, box, near, far, step_size, num_steps
     return np.array(kept)
 
 
-def interpolate_dense_loop(table, unit_position, resolution):
-    """Trilinear interpolation of a dense level at one point in [0, 1]^3."""
-    box = np.array([[0.0] * 3, [1.0] * 3])
-    side = resolution + 1
+def dense_row(vertex, side):
+    """Row of a vertex [3] of a level that has one for each, `side` of them along an axis."""
+    i, j, k = vertex
+    return (i * side + j) * side + k
+
+
+def hashed_row(vertex, table_size):
+    """Row of a vertex [3] by the spatial hash of Mueller et al. 2022, Eq 4, in whole numbers."""
+    i, j, k = (int(n) for n in vertex)
+    product = [i, (j * 2654435761) % 2**32, (k * 805459861) % 2**32]
+    return (product[0] ^ product[1] ^ product[2]) % table_size
+
+
+def interpolate_level_loop(table, unit_position, resolution):
+    """Trilinear interpolation of a level at one point in [0, 1]^3."""
+    box, side = np.array([[0.0] * 3, [1.0] * 3]), resolution + 1
     total = 0.0
-    for (i, j, k), weight in trilinear_loop(box, resolution, unit_position).items():
-        total = total + weight * np.asarray(table, np.float64)[(i * side + j) * side + k]
+    for vertex, weight in trilinear_loop(box, resolution, unit_position).items():
+        is_dense = side**3 <= len(table)
+        row = dense_row(vertex, side) if is_dense else hashed_row(vertex, len(table))
+        total = total + weight * np.asarray(table, np.float64)[row]
     return total

@@ -34,9 +34,9 @@ IMAGES = {
         do.image_bytes(do.encoded(do.picture(mode="CMYK"), "JPEG")),
         r"1\.png: image has colour model CMYK: save it as 8-bit",
     ),
-    "floating-point image": Fault(
+    "image of another format": Fault(
         do.image_bytes(do.encoded(do.picture(mode="F"), "TIFF")),
-        r"1\.png: image has colour model F: save it as 8-bit",
+        r"1\.png: image cannot be read \(it is none of PNG, JPEG, WEBP, BMP\): save it again",
     ),
     "folder for an image": Fault(
         do.image_to_folder, r"1\.png: (is a folder: put an image|image is missing)"

@@ -62,6 +62,13 @@ SPARSE = {
     "garbled frames.txt": Fault(
         do.write("sparse/0/frames.txt", "1 2 3\n"), "COLMAP model cannot be read", TEXT
     ),
+    "name that is not UTF-8": Fault(
+        lambda root, layout: (root / "sparse/0/images.bin").write_bytes(
+            (root / "sparse/0/images.bin").read_bytes().replace(b"002.png", b"\xc0" + b"02.png")
+        ),
+        r"images\.bin: the name at byte \d+ is not UTF-8: rename",
+        BINARY,
+    ),
     "garbage after the images": Fault(
         lambda root, layout: (root / "sparse/0/images.bin").open("ab").write(b"more"),
         r"images\.bin: has 4 bytes after",

@@ -67,11 +67,13 @@ def write_nerfstudio(
     return root
 
 
-def write_images(folder: pathlib.Path, num: int, width: int, height: int, suffix=".png") -> None:
-    """Writes images of noise `000.png`, `001.png`, ..."""
+def write_images(
+    folder: pathlib.Path, num: int, width: int, height: int, suffix=".png", seed: int = 0
+) -> None:
+    """Writes images of noise `000.png`, `001.png`, ..., of the seeds from `seed` on."""
     folder.mkdir(parents=True, exist_ok=True)
     for i in range(num):
-        iio.imwrite(folder / f"{i:03d}{suffix}", random_image(i, width, height, 3))
+        iio.imwrite(folder / f"{i:03d}{suffix}", random_image(seed + i, width, height, 3))
 
 
 def write_llff(
@@ -153,7 +155,7 @@ def write_nerfplusplus(root: pathlib.Path, *, num_train: int = 4, num_test: int 
     camera = np.eye(4)
     camera[0, 0], camera[1, 1], camera[:2, 2] = 15.0, 16.0, [5.5, 4.5]
     for split, first, num in (("train", 0, num_train), ("test", num_train, num_test)):
-        write_images(root / split / "rgb", num, 12, 8)
+        write_images(root / split / "rgb", num, 12, 8, seed=first)
         for kind in ("pose", "intrinsics"):
             (root / split / kind).mkdir()
         for i in range(num):

@@ -7,14 +7,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bavs_jax.selection.batch import SelectionInfo, acquire
+from bavs_jax.selection.distances import pairwise_distances
+from bavs_jax.selection.policies import get_policy
 from experiments.bench.ceilings import measure_ceilings
-from experiments.bench.clock import timed
+from experiments.bench.clock import timed, timed_runs
 from experiments.bench.counts import Work, compiled_work
 from experiments.bench.fits import fit_growth
 from experiments.bench.measure import benchmark
 from experiments.bench.results import BENCHMARK, STAGES, amount, benchmark_tables, duration
 from experiments.bench.settings import default_sizes
-from experiments.bench.work import slot_width
+from experiments.bench.stages import make_selection_run
+from experiments.bench.subject import make_subject
+from experiments.bench.work import selection_work, slot_width
+from experiments.build_scene import load_config_scene
 from experiments.report.collected import collected_text
 from tests.toy_runs import toy_config
 
@@ -92,10 +98,43 @@ def test_ceilings_are_what_the_best_run_reached(monkeypatch):
     assert ceilings.bytes_per_s == 2 * 10**6 / 2.0
 
 
-def test_timing_waits_for_the_result():
-    seconds, value = timed(lambda: jnp.arange(3) + 1)
-    assert seconds > 0
-    np.testing.assert_array_equal(value, [1, 2, 3])
+def test_timing_waits_for_the_result(monkeypatch):
+    """With a clock that only work moves: 1 s until a call returns, 5 s more for each result."""
+    now = [0.0]
+    monkeypatch.setattr("experiments.bench.clock.time.perf_counter", lambda: now[0])
+
+    class Pending:
+        def block_until_ready(self):
+            now[0] += 5.0
+            return self
+
+    results = {"a": Pending(), "b": [Pending()]}
+
+    def dispatch():
+        now[0] += 1.0
+        return results
+
+    assert timed(dispatch) == (11.0, results)
+    assert timed_runs(dispatch, 3) == ([11.0] * 3, [results] * 3)
+
+
+# --- stages ----------------------------------------------------------------------------------
+
+
+def test_selection_is_timed_by_the_path_of_runs():
+    config = toy_config()
+    subject = make_subject(config, load_config_scene(config, cache_dir=None), 3)
+    run, ctx = make_selection_run(subject, 32, 4)
+    selected, info = run()
+    chosen, expected = acquire(get_policy("bavs"), jax.random.key(1), ctx, 4)
+    np.testing.assert_array_equal(selected, chosen)
+    assert isinstance(info, SelectionInfo) and 4 <= info.survivors.sum() < 32
+    np.testing.assert_array_equal(info.scores, expected.scores)
+    one = compiled_work(pairwise_distances, ctx.positions, ctx.positions[:1])
+    fewer = info._replace(survivors=info.survivors & (np.cumsum(info.survivors) <= 4))
+    extra = selection_work(ctx, info).flops - selection_work(ctx, fewer).flops
+    # A survivor is compared with all candidates by the filter, and again where it is ranked.
+    assert extra == 2 * one.flops * (info.survivors.sum() - 4)
 
 
 # --- fits ------------------------------------------------------------------------------------

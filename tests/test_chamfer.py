@@ -28,11 +28,11 @@ def test_two_spheres_are_apart_by_the_difference_of_their_radii(r, big):
     assert got.f_score == (1.0 if big - r <= 0.2 else 0.0)
 
 
-@pytest.mark.parametrize("shift", [0.0, 0.03, 0.5])
+@pytest.mark.parametrize("shift", [0.0, 0.03, 0.125, 0.5])
 def test_shifted_planes(shift):
-    got = surface_error(plane(0.0), plane(shift), distance=0.1)
+    got = surface_error(plane(0.0), plane(shift), distance=0.125)
     np.testing.assert_allclose([got.accuracy, got.completeness, got.chamfer], shift, atol=1e-12)
-    assert got.precision == got.recall == got.f_score == float(shift <= 0.1)
+    assert got.precision == got.recall == got.f_score == float(shift <= 0.125)
 
 
 def test_half_of_a_surface_is_accurate_but_not_complete():

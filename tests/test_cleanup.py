@@ -9,7 +9,7 @@ import pytest
 
 from bavs_jax.cameras import Rays
 from bavs_jax.fields.base import Field
-from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.fields.deformation import DeformationGrid, offset_unit
 from bavs_jax.metrics.covered import PixelSums, Sweep, is_empty, pixel_sums, sweep_of
 from bavs_jax.rendering.pixels import render_pixels
 from bavs_jax.uncertainty.channel import vertex_variance
@@ -119,7 +119,7 @@ def render(cleaned_fn, variance):
 @pytest.fixture(scope="module")
 def chosen(render, variance):
     """The sweep of the training rays and the threshold that the rule takes."""
-    thresholds = spread_thresholds(variance, 20)
+    thresholds = spread_thresholds(variance, 20, offset_unit(BOX))
     rays = rays_to_wall()
     images = render(thresholds, rays)
     truth = images["rgb"][:, -1]
@@ -228,11 +228,11 @@ def test_a_sweep_compiles_once(cleaned_fn, render, variance):
 
 
 def test_thresholds_span_the_vertices_and_mean_a_length():
-    thresholds = spread_thresholds(jnp.array([1e-4, 1.0, 1e8]), 5)
-    # log10 sigma is -2, 0 and 4: 1/9, 3/9 and 7/9 on [0, 1].
+    thresholds = spread_thresholds(100.0 * jnp.array([1e-4, 1.0, 1e8]), 5, 10.0)
+    # log10 sigma in tens of units is -2, 0 and 4: 1/9, 3/9 and 7/9 on [0, 1].
     np.testing.assert_allclose(thresholds[:-1], np.linspace(1 / 9, 7 / 9, 5), rtol=1e-6)
     assert np.isposinf(thresholds[-1])
-    np.testing.assert_allclose(threshold_sigma([1 / 9, 3 / 9]), [1e-2, 1.0])
+    np.testing.assert_allclose(threshold_sigma([1 / 9, 3 / 9], 10.0), [0.1, 10.0])
 
 
 # --- the measures ---

@@ -5,6 +5,7 @@ import pytest
 
 from bavs_jax.fields.contraction import scene_positions, unit_coordinates
 from bavs_jax.fields.deformation import DeformationGrid, grid_coordinates, vertex_positions
+from bavs_jax.selection import directional
 from bavs_jax.selection.directional import (
     DirectionalInformation,
     Look,
@@ -13,7 +14,7 @@ from bavs_jax.selection.directional import (
     make_precision_fn,
     same_side,
 )
-from bavs_jax.selection.information import sparse_curvature
+from bavs_jax.selection.information import MIN_ROWS, sparse_curvature
 from tests import oracles_information as oracles
 
 NUM, NUM_VERTICES, PRIOR = 6, 12, 0.05
@@ -113,6 +114,24 @@ def test_memory_changes_nothing_and_looks_may_be_taken_back(max_bytes):
             directional_gains(information, [3, 1, 4]),
             directional_gains(fresh._replace(looks=information.looks), [3, 1, 4]),
         )
+
+
+@pytest.mark.parametrize("kept, max_bytes", [(0, 0), (1, 12 * MIN_ROWS), (3, 2**20)])
+def test_memory_is_bounded_and_spares_looks(kept, max_bytes, monkeypatch):
+    """Two looks are added to each of three candidates, but to those that are remembered once."""
+    added = []
+
+    def add(precision, *args):
+        added.append(precision.nbytes)
+        return add_look_once(precision, *args)
+
+    add_look_once = directional._add_look
+    monkeypatch.setattr(directional, "_add_look", add)
+    information = information_of(*toy(6), max_bytes=max_bytes)
+    directional_gains(information, [3, 1, 4])
+    assert len(added) == 6 and kept == min(max_bytes // added[0], 3)
+    directional_gains(information, [3, 1, 4])
+    assert len(added) == 6 + 2 * (3 - kept)
 
 
 def test_same_side_at_its_limits():

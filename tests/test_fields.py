@@ -8,7 +8,7 @@ import pytest
 from bavs_jax.fields.encodings import interpolate_level, level_resolutions, spherical_harmonics
 from bavs_jax.fields.hash_grid import make_hash_grid_field
 from bavs_jax.numerics import density_from_raw, safe_divide, safe_reciprocal
-from tests.oracles_rendering import interpolate_dense_loop
+from tests.oracles_rendering import interpolate_level_loop
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -21,14 +21,42 @@ def test_levels_grow_from_coarsest_to_finest():
     np.testing.assert_allclose(np.diff(np.log(levels)), np.log(8) / 7, atol=0.03)  # rounding
 
 
-def test_dense_level_agrees_with_a_loop():
-    table = jax.random.normal(jax.random.key(0), (6**3, 2))
+@pytest.mark.parametrize("rows", [6**3, 64])
+def test_dense_and_hashed_levels_agree_with_a_loop(rows):
+    table = jax.random.normal(jax.random.key(0), (rows, 2))
     points = np.concatenate(
         [jax.random.uniform(jax.random.key(1), (20, 3)), np.eye(3), [[1, 1, 1]]]
     )
     got = interpolate_level(table, jnp.asarray(points), 5)
-    want = [interpolate_dense_loop(table, p, 5) for p in points]
+    want = [interpolate_level_loop(table, p, 5) for p in points]
     np.testing.assert_allclose(got, want, atol=1e-5)  # float32
+
+
+@pytest.mark.parametrize("rows", [6**3, 64])
+def test_the_gradient_of_a_level_adds_up_all_that_was_read_of_a_row(rows):
+    table = jax.random.normal(jax.random.key(0), (rows, 2))
+    points = jax.random.uniform(jax.random.key(1), (400, 3))
+    cotangent = jax.random.normal(jax.random.key(2), (400, 2))
+    level, pullback = jax.vjp(lambda table: interpolate_level(table, points, 5), table)
+    (grad,) = pullback(cotangent)
+    # The level is linear in its table; float32 sums of some 2000 products.
+    np.testing.assert_allclose((grad * table).sum(), (level * cotangent).sum(), rtol=1e-4)
+    other = jax.random.normal(jax.random.key(3), (rows, 2))
+    expected = (interpolate_level(other, points, 5) * cotangent).sum()
+    np.testing.assert_allclose((grad * other).sum(), expected, rtol=1e-4)
+
+
+def test_the_last_cell_owns_its_upper_face():
+    table = jax.random.normal(jax.random.key(0), (6**3, 2))
+
+    def slope(x):
+        return jax.jacobian(lambda x: interpolate_level(table, x[None], 5)[0])(x)
+
+    # A level is linear along each axis of a cell, so nothing changes up to its face.
+    for axis in np.eye(3):
+        face = np.array([0.3, 0.5, 0.7]) * (1 - axis) + axis
+        inside = slope(jnp.asarray(face - 0.1 * axis)) @ axis
+        np.testing.assert_allclose(slope(jnp.asarray(face)) @ axis, inside, rtol=1e-4)
 
 
 def test_hashed_level_is_continuous_across_cells_and_in_range():

@@ -44,7 +44,7 @@ def test_every_form_holds_the_same_poses(tmp_path, poses):
 @pytest.mark.parametrize(
     "name, text, message",
     [
-        ("a.json", "{", "is no JSON"),
+        ("a.json", "{", "line 1: .*mend the JSON"),
         ("a.json", "{}", "frames: missing"),
         ("a.json", "[]", "holds no pose"),
         ("a.json", "3", "is no list"),

@@ -140,7 +140,7 @@ def test_exported_files_agree_with_the_field(cleaned, run):
         positions = np.stack([vertices[a] for a in "xyz"], -1)
         sigma = point_fn(positions)["sigma"]
         np.testing.assert_allclose(vertices["sigma"], sigma, **tolerance)
-        expected = np.clip((np.log10(sigma) + 3.0) / 9.0, 0.0, 1.0)
+        expected = np.clip((np.log10(1.5 * sigma) + 3.0) / 9.0, 0.0, 1.0)  # of a box of side 2
         np.testing.assert_allclose(vertices["uncertainty"], expected, atol=1e-3)
     (geometry,) = json.loads((folder / "geometry.json").read_text())["rows"]
     assert geometry["round"] == 1 and geometry["num_views"] == 4

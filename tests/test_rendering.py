@@ -10,7 +10,12 @@ import pytest
 from bavs_jax.cameras import Rays
 from bavs_jax.rendering.compositing import composite, expected_depth, render_weights
 from bavs_jax.rendering.hits import nth_hit, pack_hits
-from bavs_jax.rendering.occupancy import cell_index, init_occupancy, update_occupancy
+from bavs_jax.rendering.occupancy import (
+    WARMUP_UPDATES,
+    cell_index,
+    init_occupancy,
+    update_occupancy,
+)
 from bavs_jax.rendering.packing import evaluate_all_passes, evaluate_one_pass
 from bavs_jax.rendering.render import Channel, render_rays
 from bavs_jax.rendering.sampling import make_march_options, march
@@ -48,6 +53,14 @@ def test_homogeneous_fog_has_its_closed_form():
     for num in (1, 7, 100):
         weights = render_weights(jnp.full(num, 0.7), jnp.full(num, 2.0 / num))
         np.testing.assert_allclose(weights.sum(), 1.0 - np.exp(-1.4), rtol=1e-5)
+
+
+def test_small_opacities_are_exact():
+    # 1 - exp(-x) would be 0 below x = 6e-8, and of one digit at 1e-7.
+    optical = np.array([1e-10, 1e-7, 1e-4], np.float32)
+    for x in optical:
+        weights = render_weights(jnp.array([x]), jnp.ones(1))
+        np.testing.assert_allclose(weights, -np.expm1(-np.float64(x)), rtol=1e-6)
 
 
 @pytest.mark.parametrize("density", [0.0, 1e-12, 1e5])
@@ -108,7 +121,11 @@ def test_valid_slots_come_first_and_cover_what_is_occupied():
         mask = np.asarray(samples.sample_mask)
         assert (np.diff(mask.astype(int), axis=1) <= 0).all()
         assert (np.asarray(samples.deltas)[~mask] == 0).all()
+    counts = np.asarray(full.sample_mask.sum(-1))
     assert not full.thinned.any() and thin.thinned.any()
+    for slots in (8, counts.max() - 1, counts.max()):
+        samples = march(rays, occupancy, options(num_slots=int(slots)))
+        np.testing.assert_array_equal(samples.thinned, counts > slots)
     # A thinned ray still stands for its whole way.
     np.testing.assert_allclose(full.deltas.sum(-1), thin.deltas.sum(-1), atol=1e-5)
 
@@ -168,6 +185,33 @@ def test_occupancy_finds_a_ball_and_forgets_what_is_gone():
     assert not occupancy.occupied[cell_index(occupancy, inside)].any()
 
 
+@pytest.mark.parametrize("num_updates", [WARMUP_UPDATES - 1, WARMUP_UPDATES])
+@pytest.mark.parametrize("scale", [1.0, 1e-3])
+def test_an_update_agrees_with_a_loop_over_the_samples(scale, num_updates):
+    """`scale` 1 is above the threshold on average, 1e-3 is below; some cells are drawn twice."""
+    before = scale * jax.random.exponential(jax.random.key(0), (27,))
+    occupancy = init_occupancy(BOX, resolution=3).replace(
+        density=before, num_updates=jnp.int32(num_updates)
+    )
+    seen = []
+
+    def density_fn(x):
+        seen.append((x, scale * (x[:, 0] + 1.5) ** 4))
+        return seen[0][1]
+
+    options = {"num_samples": 15, "step_size": 0.1, "decay": 0.5, "threshold": 0.05}
+    after = update_occupancy(jax.random.key(1), occupancy, density_fn, **options)
+    want, cells = np.array(before), np.asarray(cell_index(occupancy, seen[0][0]))
+    assert 5 < len(set(cells)) < 15
+    for cell in set(cells):
+        want[cell] = max(0.5 * want[cell], *np.asarray(seen[0][1])[cells == cell])
+    np.testing.assert_allclose(after.density, want, rtol=1e-6)
+    is_thick = 0.1 * want > min(0.05, 0.1 * want.mean())
+    assert 0 < is_thick.sum() < 27
+    np.testing.assert_array_equal(after.occupied, is_thick | (num_updates < WARMUP_UPDATES))
+    assert after.num_updates == num_updates + 1
+
+
 def test_fresh_occupancy_keeps_everything_at_first():
     occupancy = init_occupancy(BOX, resolution=8)
     occupancy = update_occupancy(
@@ -200,6 +244,15 @@ def test_one_pass_keeps_whole_rays_or_none():
     assert 0 < int(ray_mask.sum()) < len(mask)
     assert int(mask.sum(-1)[ray_mask].sum()) <= capacity
     want = jnp.where(mask & ray_mask[:, None], table, 0.0)
+    np.testing.assert_array_equal(got, want)
+
+
+@pytest.mark.parametrize("spare, whole_rays", [(0, 3), (-1, 2), (1, 3)])
+def test_one_pass_takes_a_ray_that_just_fits(spare, whole_rays):
+    mask = jnp.arange(12) < jnp.array([5, 0, 12, 4])[:, None]
+    got, ray_mask = evaluate_one_pass(lambda r, s, v: s + 1.0, mask, capacity=17 + spare)
+    assert ray_mask.tolist() == [row < whole_rays for row in range(4)]
+    want = jnp.where(mask & ray_mask[:, None], jnp.arange(1.0, 13.0), 0.0)
     np.testing.assert_array_equal(got, want)
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 
 import imageio.v3 as iio
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bavs_jax.cameras import image_pixels, pixel_rays
-from bavs_jax.scenes import SceneError, load_nerfstudio, load_scene
+from bavs_jax.cameras import image_pixels, look_at, make_cameras, pixel_rays
+from bavs_jax.scenes import SceneError, load_nerfstudio, load_scene, maps
 from bavs_jax.scenes.poses import user_transforms
 from tests.scene_files import (
     edit_json,
@@ -144,6 +146,24 @@ def test_depth_in_millimetres_becomes_distance_along_the_ray(tmp_path, suffix):
     np.testing.assert_allclose(
         half.depth_image(2)[0], wall_depth(half, 2, 2.5 * unit)[0], rtol=1e-5
     )
+
+
+@pytest.mark.parametrize("lens", ["pinhole", "opencv", "fisheye"])
+def test_depth_of_a_large_image_is_that_of_each_ray_by_itself(lens):
+    """At 32,400 pixels, where XLA for CPUs once gave rays the directions of others."""
+    width, height = 240, 135
+    distortion = [[-0.05, 0.01, 0.0, 0.0, 0.002, -0.001]] if lens == "opencv" else None
+    pose = look_at([1.0, 2.0, 3.0], [0.2, 0.1, -0.3])
+    cameras = make_cameras(
+        [pose], [[200.0, 205.0, 118.0, 70.0]], [[width, height]], distortion=distortion, lens=lens
+    )
+    found = maps.along_rays(np.full((height, width), 2.5, np.float32), cameras, 0)
+    with jax.enable_x64(True):
+        double = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), cameras)
+        pixels = jnp.asarray(image_pixels(width, height), jnp.float64)
+        rays = pixel_rays(double, np.zeros(len(pixels), int), pixels)
+        cosine = np.asarray(rays.directions) @ -pose[:, 2]
+    np.testing.assert_allclose(found, (2.5 / cosine).reshape(height, width), rtol=2e-6)
 
 
 def test_depth_sensors_may_be_coarser_than_the_camera(tmp_path):

@@ -135,3 +135,60 @@ def test_without_pycolmap_the_message_says_what_to_install(tmp_path, monkeypatch
     with pytest.raises(SceneError, match=r"pip install 'bavs_jax\[colmap\]'"):
         load_colmap(root)
     assert load_nerfstudio(write_nerfstudio(tmp_path / "other")).num_views == 8
+
+
+# --- several models --------------------------------------------------------------------------
+
+PINHOLE = {"model": "PINHOLE", "width": 12, "height": 8, "params": [15.0, 15.0, 6.0, 4.0]}
+
+
+def write_model(folder, num: int, *, text: bool = False, focal: float = 15.0) -> None:
+    camera = PINHOLE | {"params": [focal, focal, 6.0, 4.0]}
+    write_colmap_model(folder, num=num, cameras=[camera], text=text)
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("largest", ["sparse/1", "sparse/10", "sparse", "colmap/sparse/1"])
+def test_of_several_models_the_largest_is_taken(tmp_path, largest, text):
+    write_images(tmp_path / "images", 9, 12, 8)
+    write_model(tmp_path / "sparse/0", 4, text=text)
+    write_model(tmp_path / "sparse/2", 5, text=text)
+    write_model(tmp_path / largest, 8, text=text)
+    with pytest.warns(UserWarning) as caught:
+        scene = load_colmap(tmp_path)
+    models, unposed = (str(warning.message) for warning in caught)
+    assert scene.num_views == 8
+    assert models.startswith(f"{tmp_path / largest}: model taken, with 8 images; left out: ")
+    assert models.endswith("sparse/2 with 5, sparse/0 with 4")
+    assert unposed.endswith("1 of 9 photos in images have no pose (008.png): left out")
+
+
+def test_photos_before_the_distortion_was_taken_out(tmp_path):
+    """A model in `distorted` belongs to the photos in `input`, however many images it has."""
+    write_images(tmp_path / "input", 9, 12, 8)
+    write_model(tmp_path / "distorted/sparse/0", 4)
+    write_model(tmp_path / "distorted/sparse/1", 9, focal=20.0)
+    assert detect_kind(tmp_path) == "colmap"
+    with pytest.warns(UserWarning, match=r"sparse/1: model taken, .*sparse/0 with 4"):
+        scene = load_colmap(tmp_path)
+    assert scene.names[3] == "input/003.png"
+    np.testing.assert_allclose(scene.cameras.intrinsics[:, 0], 20.0)
+
+    write_images(tmp_path / "images", 9, 12, 8)
+    write_model(tmp_path / "sparse/0", 8)
+    with pytest.warns(UserWarning, match="left out: distorted/sparse/1 with 9, distorted/sparse/0"):
+        scene = load_colmap(tmp_path)
+    assert scene.names[3] == "images/003.png"
+    np.testing.assert_allclose(scene.cameras.intrinsics[:, 0], 15.0)
+
+
+def test_photos_without_a_pose_are_counted_and_named(tmp_path):
+    root = write_colmap(tmp_path)
+    write_images(root / "images/more", 4, 12, 8, seed=100)
+    with pytest.warns(UserWarning) as caught:
+        assert load_colmap(root).num_views == 9
+    assert len(caught) == 1
+    assert str(caught[0].message).endswith(
+        "4 of 13 photos in images have no pose (more/000.png, more/001.png, more/002.png, ...): "
+        "left out"
+    )

@@ -92,6 +92,7 @@ def test_fused_selector_and_driver_agree():
         driven, info = acquire(policy_of(scores, distance_filter=True), KEY, ctx, 4)
         np.testing.assert_array_equal(driven, fused)
         np.testing.assert_array_equal(info.survivors, survivors)
+        np.testing.assert_array_equal(info.scores, np.where(survivors, scores, np.nan))
 
 
 # --- the driver ------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ import pytest
 
 from experiments.configs import quickstart
 from experiments.errors import ConfigError
+from experiments.files import write_arrays, write_json
 from experiments.sweeps.axes import parse_axes, setting_name, settings
 from experiments.sweeps.plan import make_settings, make_trials
 from experiments.sweeps.record import Record, merged, read_record, write_record
@@ -219,8 +220,10 @@ def test_a_trial_is_a_single_run_of_one_part_and_shares_round_0(tmp_path):
     assert "--config.policies=('random', 'bavs')" in argv and "--config.batch_size=2" in argv
     assert "--part=random/seed_4" in argv and "--compilation_cache_dir=c" in argv
     done = first.folder / "random" / "seed_4"
-    done.mkdir(parents=True)
-    (done / "result.json").write_text('{"completed": true}')
+    write_json(done / "result.json", {"completed": True})
+    assert [t.part.name for t in make_trials(first, [])] == [t.part.name for t in trials]
+    write_json(done / "next_views" / "transforms.json", {})
+    write_arrays(done / "acquisition.npz")
     assert [t.part.name for t in make_trials(first, [])] == ["initial/seed_4", "bavs/seed_4"]
 
 

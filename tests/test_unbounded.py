@@ -9,7 +9,7 @@ import pytest
 
 from bavs_jax.cameras import Rays
 from bavs_jax.fields.base import DensityField
-from bavs_jax.fields.contraction import contract, uncontract, unit_coordinates
+from bavs_jax.fields.contraction import contract, in_box, uncontract, unit_coordinates
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.rendering.compositing import composite_colour, render_weights
 from bavs_jax.rendering.histograms import (
@@ -91,6 +91,15 @@ def test_unit_coordinates_put_the_box_into_the_middle_half():
     np.testing.assert_allclose(far, [[1.0, 0.5, 0.5]], atol=1e-6)
 
 
+def test_the_box_ends_at_its_faces():
+    box = jnp.array([[-1.0, -2.0, 0.0], [3.0, 2.0, 8.0]])
+    middle, half = box.mean(0), 0.5 * (box[1] - box[0])
+    for axis in np.concatenate([np.eye(3), -np.eye(3)]):
+        for share, inside in ((0.999, True), (1.001, False), (50.0, False)):
+            unit = unit_coordinates(box, middle + share * axis * half, contracted=True)
+            assert in_box(unit, contracted=True) == inside
+
+
 # --- histograms ------------------------------------------------------------------------------
 
 
@@ -144,6 +153,13 @@ def test_a_proposal_that_bounds_the_field_costs_nothing():
     np.testing.assert_allclose(interlevel_loss(edges, weights, edges, weights), 0.0, atol=1e-10)
     whole = overlapping_weight(edges, weights, edges[:, :1], edges[:, -1:])
     np.testing.assert_allclose(whole[:, 0], weights.sum(-1), rtol=1e-6)
+
+
+def test_intervals_that_only_touch_do_not_overlap():
+    edges, weights = histograms()
+    np.testing.assert_array_equal(
+        overlapping_weight(edges, weights, edges[:, :-1], edges[:, 1:]), weights
+    )
 
 
 def test_distortion_of_one_interval_is_a_third_of_its_width_and_of_two_points_their_distance():

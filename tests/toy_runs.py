@@ -1,5 +1,10 @@
 """A configuration of the real script that is small enough for tests."""
 
+import json
+import pathlib
+
+import numpy as np
+
 from experiments.configs import quickstart
 
 OVERRIDES = {
@@ -43,3 +48,38 @@ def toy_flags(**overrides) -> list[str]:
     values = OVERRIDES | {k.replace("__", "."): v for k, v in overrides.items()}
     options = [f"--config.{name}={value}" for name, value in values.items()]
     return ["--config=experiments/configs/quickstart.py", *options]
+
+
+# Of the least length that has rounds, checkpoints within them and a choice.
+TINY = {"num_rounds": 1, "train__num_steps": 8, "num_test": 1, "num_test_final": 1}
+
+
+def same_results(folder, other):
+    """Asserts that two runs came to the same end: files, choices and measures, but for times."""
+    kept = ("result.json", "acquisition.npz", "pictures.npz", "transforms.json", "report.html")
+    names = [
+        sorted(str(p.relative_to(f)) for p in f.rglob("*") if p.name in (*kept, "config.json"))
+        for f in (folder, other)
+    ]
+    assert names[0] == names[1] and len(names[0]) >= 5
+    runs, wanted = (json.loads((f / "summary.json").read_text())["runs"] for f in (folder, other))
+    assert len(runs) == len(wanted) > 0
+    for got, want in zip(runs, wanted):
+        path = pathlib.Path(got["policy"], f"seed_{got['seed']}")
+        assert got == json.loads((folder / path / "result.json").read_text())
+        assert (got["policy"], got["seed"], got["completed"]) == (
+            *(want["policy"], want["seed"]),
+            True,
+        )
+        for a, b in zip(got["rounds"], want["rounds"], strict=True):
+            assert (a["selected"], a["num_views"]) == (b["selected"], b["num_views"])
+            # Threads of the CPU may add up in another order.
+            for name in ("psnr", "ssim", "depth_mae"):
+                np.testing.assert_allclose(a[name], b[name], atol=1e-3)
+        with (
+            np.load(folder / path / "acquisition.npz") as a,
+            np.load(other / path / "acquisition.npz") as b,
+        ):
+            for name in ("selected", "initial", "survivors"):
+                np.testing.assert_array_equal(a[name], b[name])
+            np.testing.assert_allclose(a["scores"], b["scores"], atol=1e-3)

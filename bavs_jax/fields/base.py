@@ -25,6 +25,7 @@ class Field(NamedTuple):
     `inputs(rays, samples [R, S], view_ids [R] or None) -> {name: [R, S, ...]}`, what more the
       field reads at each sample: the size of a pixel's cone there, or the view it belongs to.
       `view_ids` are given only where the views are trained on.
+    `reads_views`: whether `inputs` depend on `view_ids`, as with appearance codes
 
     Positions are in scene units, directions are unit vectors, density is in 1 / scene unit and
     colour is sRGB in [0, 1].
@@ -35,6 +36,7 @@ class Field(NamedTuple):
     density: Callable[..., Any]
     penalty: Callable[[Params], Any] = lambda params: 0.0
     inputs: Callable[..., dict] = no_inputs
+    reads_views: bool = False
 
 
 class DensityField(NamedTuple):

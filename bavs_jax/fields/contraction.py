@@ -22,9 +22,14 @@ def contract(x: jax.Array) -> jax.Array:
     """Maps all of space [..., 3] into (-2, 2)^3; the identity in [-1, 1]^3.
 
     Numerics: the norm is clipped to at least 1, which makes both branches one formula, continuous
-    with its radial derivative. Where two coordinates share the maximum there is a kink.
+    with its radial derivative. Where two coordinates share the maximum there is a kink. The
+    derivative of `max` asks which entry equals the maximum; a compiler that computes the entries
+    anew, rounded otherwise, finds none and divides by 0. A comparison has no such gap.
     """
-    norm = jnp.maximum(jnp.abs(x).max(-1, keepdims=True), 1.0)
+    norm = 1.0
+    for axis in range(3):
+        size = jnp.abs(x[..., axis : axis + 1])
+        norm = jnp.where(size > norm, size, norm)
     return (2.0 - 1.0 / norm) / norm * x
 
 

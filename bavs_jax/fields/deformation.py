@@ -62,6 +62,16 @@ def cell_sides(grid: DeformationGrid) -> np.ndarray:
     return np.asarray(upper - lower, np.float64)
 
 
+def offset_unit(box) -> jax.Array:
+    """The length that the prior and the log scale measure offsets in, [] scene units.
+
+    A third of the mean side of the scene box [2, 3], so that nothing depends on where a scene
+    lies, or on how large it is. In the boxes of the Blender scenes and of most captures, which are
+    3 units wide, it is the scene unit itself.
+    """
+    return (box[1] - box[0]).sum() / 9.0
+
+
 def vertices_in_box(grid: DeformationGrid) -> jax.Array:
     """Which vertices lie in the scene box, [G] bool: all of them where space is not contracted."""
     return in_box(jnp.asarray(unit_vertices(grid)), contracted=grid.contracted)

@@ -25,6 +25,7 @@ class HashGridField(nn.Module):
       num_views: rows of the table of appearance codes.
       appearance_features: of each view's code; 0 for none.
       learned_variance: whether the field also gives a variance of its colour.
+      log_density: of the field before it is trained, 1 / scene unit.
     """
 
     resolutions: tuple[int, ...]
@@ -95,7 +96,7 @@ def make_hash_grid_field(
     num_views: int = 0,
     appearance_features: int = 0,
     learned_variance: bool = False,
-    initial_density: float = 1.0,
+    initial_optical_depth: float = 0.3,
 ) -> Field:
     """Makes a hash-grid field over a box, or over contracted space around it.
 
@@ -113,6 +114,8 @@ def make_hash_grid_field(
         balance; 0 for none. Views that are not trained on are read with the mean code.
       learned_variance: `apply` also returns `{"beta": [K]}`, `softplus(.) + 0.01`, the variance of
         a point's colour (ActiveNeRF); trained by `make_variance_objective`.
+      initial_optical_depth: density times the box's side before training. A thick fog would hide
+        from each ray what lies behind, and fill every sample there is room for.
 
     Returns:
       A `Field`.
@@ -128,7 +131,7 @@ def make_hash_grid_field(
         num_views=num_views,
         appearance_features=appearance_features,
         learned_variance=learned_variance,
-        log_density=math.log(initial_density),
+        log_density=math.log(initial_optical_depth / float((box[1] - box[0]).mean())),
     )
 
     def to_unit(positions):
@@ -155,7 +158,10 @@ def make_hash_grid_field(
     def penalty(params):
         return table_penalty(params["encoding"])
 
-    return Field(init, apply, density, penalty, inputs if appearance_features else no_inputs)
+    has_codes = appearance_features > 0
+    return Field(
+        *(init, apply, density, penalty, inputs if has_codes else no_inputs), reads_views=has_codes
+    )
 
 
 def table_penalty(tables: dict) -> jax.Array:

@@ -45,7 +45,9 @@ def sparsification_curve(errors, order_by, fractions, *, error: str = "mae") -> 
 
     Returns:
       [F]. `ceil((1 - f) N)` pixels are left. Pixels of equal `order_by` go in a random order: the
-      curve is its mean over these orders, so that where pixels stand in memory never matters.
+      curve is its mean over these orders, so that where pixels stand in memory never matters. Of
+      "rmse" it is the root of that mean, of squares: the mean of the roots, which is at most as
+      large, has no closed form.
 
     Raises:
       ValueError: no pixels, shapes differ, values are not finite, or an unknown error.

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from bavs_jax.cameras import Cameras, image_pixels, pixel_rays
+from bavs_jax.cameras import Cameras, image_pixels, pixel_rays, take
 
 
 def render_pixels(
@@ -33,10 +33,12 @@ def render_pixels(
       dict of host arrays [N, ...].
     """
     num = len(view_ids)
+    cameras = jax.tree.map(np.asarray, cameras)
     parts = []
     for start in range(0, num, chunk):
         rows = np.minimum(np.arange(start, start + chunk), num - 1)
-        rays = _pixel_rays(cameras, view_ids[rows], pixels[rows])
+        # A camera for each ray: compiled once, however many cameras there are.
+        rays = _pixel_rays(take(cameras, view_ids[rows]), np.arange(chunk), pixels[rows])
         count = min(chunk, num - start)
         parts.append(jax.tree.map(lambda x, n=count: np.asarray(x)[:n], chunk_fn(rays)))
         if progress_fn is not None:

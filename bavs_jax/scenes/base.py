@@ -8,9 +8,25 @@ import numpy as np
 
 from bavs_jax.cameras import Cameras, rescale
 
+LONGEST_MESSAGE = 1000  # characters; a file may hold a name or a value of any length
+
+
+def printable(text) -> str:
+    """Text that any terminal and any file takes, on one line: what cannot be printed is escaped.
+
+    Names of files, and names in files, may hold line breaks, terminal escapes and surrogates.
+    """
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in str(text)
+    )
+
 
 class SceneError(ValueError):
     """Input that cannot be used: one line that names the file, the field and the fix."""
+
+    def __init__(self, message: str):
+        text, half = printable(message), LONGEST_MESSAGE // 2
+        super().__init__(text if len(text) <= 2 * half else f"{text[:half]} ... {text[-half:]}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +107,7 @@ def photo_cameras(scene: Scene, cameras: Cameras) -> Cameras:
 
 
 def alpha_table(views: list[tuple[np.ndarray, np.ndarray | None]]) -> np.ndarray | None:
-    """`Scene.alpha` of views (colour [H, W, 3], opacity [H, W] or None); None where all are opaque."""
+    """`Scene.alpha` of views (colour [H, W, 3], opacity [H, W] or None); None if all are opaque."""
     if all(alpha is None for _, alpha in views):
         return None
     opaque = (np.full(colour.shape[:2], 255, np.uint8) for colour, _ in views)

@@ -7,9 +7,8 @@ import pathlib
 
 import numpy as np
 
-from bavs_jax.cameras import make_cameras
-from bavs_jax.scenes import checks, images
-from bavs_jax.scenes.base import Scene, SceneError, alpha_table, pixel_table
+from bavs_jax.scenes import checks, images, texts
+from bavs_jax.scenes.base import Scene, SceneError, alpha_table, pixel_table, printable
 
 BOX_HALF_SIDE = 1.5  # scene units; the objects of this data set fit into it
 NEAR, FAR = 2.0, 6.0  # scene units
@@ -51,7 +50,7 @@ def load_depth(image_path: pathlib.Path, image: np.ndarray, size) -> np.ndarray 
 def load_split(root: pathlib.Path, split: str, *, image_size, background, strict: bool) -> dict:
     """Loads one `transforms_<split>.json`: a dict of lists with one entry per view."""
     path = root / f"transforms_{split}.json"
-    data = checks.read_json(path)
+    data = texts.read_json(path)
     frames = checks.check_frames(data, path)
     angle = checks.check_number(data.get("camera_angle_x"), path, "camera_angle_x", positive=True)
     if angle >= math.pi:
@@ -61,7 +60,8 @@ def load_split(root: pathlib.Path, split: str, *, image_size, background, strict
     files = [images.find_image(root, frame["file_path"]) for frame in frames]
     kept = checks.keep_existing(frames, files, path, strict=strict)
 
-    views = {"poses": [], "intrinsics": [], "images": [], "depths": [], "names": [], "sizes": []}
+    fields = ("poses", "intrinsics", "images", "depths", "files", "names", "sizes")
+    views = {field: [] for field in fields}
     original = None
     for index in kept:
         field = f"frames[{index}].transform_matrix"
@@ -80,6 +80,7 @@ def load_split(root: pathlib.Path, split: str, *, image_size, background, strict
             [focal * size[0] / width, focal * size[1] / height, 0.5 * size[0], 0.5 * size[1]]
         )
         views["sizes"].append((width, height))
+        views["files"].append(files[index])
         views["names"].append(checks.view_name(files[index], root))
     checks.check_places(np.stack(views["poses"]), path)
     return views
@@ -117,6 +118,7 @@ def load_blender(
             f"{root / 'transforms_test.json'}: '{view}' is also in transforms_train.json: "
             "list it in one"
         )
+    images.look_over(views["files"], root, root)
 
     colours = [colour for colour, _ in views["images"]]
     pixels, offsets = pixel_table(colours)
@@ -126,11 +128,13 @@ def load_blender(
         depth, _ = pixel_table([u if d is None else d for d, u in zip(views["depths"], unknown)])
     box = np.array([[-BOX_HALF_SIDE] * 3, [BOX_HALF_SIDE] * 3], np.float32)
     return Scene(
-        name=root.resolve().name,
-        cameras=make_cameras(
+        name=printable(root.resolve().name),
+        cameras=checks.build_cameras(
             views["poses"],
             views["intrinsics"],
             [(im.shape[1], im.shape[0]) for im in colours],
+            names=views["names"],
+            path=root,
         ),
         pixels=pixels,
         offsets=offsets,

@@ -9,8 +9,8 @@ from collections.abc import Callable
 import numpy as np
 
 from bavs_jax.cameras import Cameras, rescale
-from bavs_jax.scenes import checks, images, maps
-from bavs_jax.scenes.base import Scene, SceneError, alpha_table, pixel_table
+from bavs_jax.scenes import checks, folds, images, maps
+from bavs_jax.scenes.base import Scene, SceneError, alpha_table, pixel_table, printable
 from bavs_jax.scenes.extent import scene_extent
 from bavs_jax.scenes.normalise import level_and_scale, transform_poses
 from bavs_jax.scenes.splits import choose_split
@@ -89,6 +89,8 @@ def make_scene(
         path=source,
     )
     checks.check_places(capture.poses, source)
+    if scale is not None:
+        scale = checks.check_number(scale, source, "scale", positive=True)
     scene_from_file = level_and_scale(capture.poses, scale=scale)
     unit = float(np.cbrt(np.linalg.det(scene_from_file[:3, :3])))
 
@@ -112,8 +114,11 @@ def make_scene(
         for file, (width, height) in zip(capture.files, cameras.sizes)
     ]
     pixels, offsets = pixel_table([colour for colour, _ in shrunk])
+    names = tuple(checks.view_name(file, capture.root) for file in capture.files)
+    depth, pixel_mask = depth_table(capture, cameras, unit), mask_table(capture, cameras, names)
+    images.look_over(capture.files, capture.root, source)
     return Scene(
-        name=capture.root.resolve().name,
+        name=printable(capture.root.resolve().name),
         cameras=cameras,
         pixels=pixels,
         offsets=offsets,
@@ -123,9 +128,9 @@ def make_scene(
         near=near,
         far=far,
         background=np.asarray(background, np.float32),
-        names=tuple(checks.view_name(file, capture.root) for file in capture.files),
-        depth=depth_table(capture, cameras, unit),
-        pixel_mask=mask_table(capture, cameras),
+        names=names,
+        depth=depth,
+        pixel_mask=pixel_mask,
         alpha=alpha_table(shrunk),
         unbounded=unbounded,
         photo_sizes=np.asarray(capture.cameras.sizes, np.int32),
@@ -133,15 +138,21 @@ def make_scene(
     )
 
 
-def mask_table(capture: Capture, cameras: Cameras) -> np.ndarray | None:
-    """`Scene.pixel_mask` at the sizes of `cameras`, or None where there are no masks."""
+def mask_table(capture: Capture, cameras: Cameras, names: tuple[str, ...]) -> np.ndarray | None:
+    """`Scene.pixel_mask` at the sizes of `cameras`, or None where every pixel counts.
+
+    What a mask leaves out does not count, nor what lies beyond the range of the lens.
+    """
+    shown = folds.shown_masks(cameras, names, capture.source)
     if not capture.masks:
-        return None
+        return None if shown is None else pixel_table(shown)[0]
     table = []
     for view, path in enumerate(capture.masks):
         size = tuple(int(n) for n in capture.cameras.sizes[view])
         mask = maps.read_mask(path, size, capture.files[view])
         mask = maps.shrink_mask(mask, *(int(n) for n in cameras.sizes[view]))
+        if shown is not None:
+            mask &= shown[view]
         if not mask.any():
             width, height = cameras.sizes[view]
             raise SceneError(

@@ -3,30 +3,31 @@
 from __future__ import annotations
 
 import functools
-import json
 import math
 import os
 import pathlib
-import warnings
 
 import numpy as np
 
-from bavs_jax.scenes.base import SceneError
+from bavs_jax.cameras import Cameras, make_cameras
+from bavs_jax.scenes import images
+from bavs_jax.scenes.base import SceneError, printable
 
 # Poses written with six digits pass; a scaled or sheared rotation does not.
 ORTHONORMAL_TOLERANCE = 1e-3
-NAMES_IN_WARNING = 3
 ONE_PLACE = 1e-6  # spread of camera positions, relative to their size, below which they coincide
 SIZE_TOLERANCE = 1.0  # pixels; image sizes are rounded when a data set is scaled down
+# Numbers become float32, of up to 3e38: squares of these are finite, and so are rays.
+LARGEST, SMALLEST_FOCAL = 1e18, 1e-9
 
 
 def name_refusals(load_fn):
     """Wraps a loader: what the operating system refuses becomes a `SceneError` with the file."""
 
     @functools.wraps(load_fn)
-    def load(root, **options):
+    def load(root, *args, **options):
         try:
-            return load_fn(root, **options)
+            return load_fn(root, *args, **options)
         except OSError as error:
             path, reason = error.filename or root, error.strerror or error
             raise SceneError(f"{path}: {reason}: check the file and its permissions") from error
@@ -36,27 +37,12 @@ def name_refusals(load_fn):
 
 def scene_folder(root) -> pathlib.Path:
     """The scene's folder, which must exist."""
-    root = pathlib.Path(root).expanduser()
-    if not root.exists():
+    root = pathlib.Path(os.path.expanduser(root))
+    if not os.path.exists(root):  # nor can be, of such a name
         raise SceneError(f"{root}: folder is missing: check the path to the scene")
     if not root.is_dir():
         raise SceneError(f"{root}: is a file: give the scene's folder")
     return root
-
-
-def read_json(path: pathlib.Path) -> dict:
-    """Reads a JSON file whose top level is an object."""
-    if not path.is_file():
-        raise SceneError(f"{path}: file is missing: check the scene's folder")
-    try:
-        data = json.loads(path.read_text(encoding="utf-8-sig"))
-    except UnicodeDecodeError as error:
-        raise SceneError(f"{path}: not UTF-8 text ({error.reason}): save it as UTF-8") from error
-    except json.JSONDecodeError as error:
-        raise SceneError(f"{path}: line {error.lineno}: {error.msg}: mend the JSON") from error
-    if not isinstance(data, dict):
-        raise SceneError(f"{path}: top level is a {type(data).__name__}: make it an object")
-    return data
 
 
 def check_frames(data: dict, path: pathlib.Path) -> list[dict]:
@@ -93,8 +79,14 @@ def check_number(value, path: pathlib.Path, field: str, *, positive: bool = Fals
     if isinstance(value, bool) or not isinstance(value, int | float):
         what = "missing" if value is None else f"{value!r} is no number"
         raise SceneError(f"{path}: {field}: {what}: give a number")
+    try:
+        value = float(value) if abs(value) > LARGEST else value
+    except OverflowError:  # a whole number of hundreds of digits
+        value = math.inf
     if not math.isfinite(value):
         raise SceneError(f"{path}: {field}: is {value}: give a finite number")
+    if abs(value) > LARGEST:
+        raise SceneError(f"{path}: {field}: is {value}: give a number of at most {LARGEST:g}")
     if positive and value <= 0:
         raise SceneError(f"{path}: {field}: is {value}: give a number above 0")
     return float(value)
@@ -106,12 +98,15 @@ def check_pose(value, path: pathlib.Path, field: str) -> np.ndarray:
         raise SceneError(f"{path}: {field}: missing: give a 4 x 4 camera-to-world matrix")
     try:
         pose = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise SceneError(f"{path}: {field}: not a matrix of numbers: give 4 x 4 numbers") from None
     if pose.shape not in ((3, 4), (4, 4)):
         raise SceneError(f"{path}: {field}: has shape {list(pose.shape)}: give a 4 x 4 matrix")
     if not np.isfinite(pose).all():
         raise SceneError(f"{path}: {field}: holds NaN or infinity: give finite numbers")
+    largest = np.abs(pose).max()
+    if largest > LARGEST:
+        raise SceneError(f"{path}: {field}: holds {largest:g}: give at most {LARGEST:g}")
     rotation = pose[:3, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if error > ORTHONORMAL_TOLERANCE:
@@ -125,6 +120,37 @@ def check_pose(value, path: pathlib.Path, field: str) -> np.ndarray:
     if pose.shape[0] == 4 and np.abs(pose[3] - last_row).max() > ORTHONORMAL_TOLERANCE:
         raise SceneError(f"{path}: {field}: last row is {pose[3].tolist()}: make it [0, 0, 0, 1]")
     return np.concatenate([pose[:3], [last_row]])
+
+
+def build_cameras(
+    poses, intrinsics, sizes, *, names: list[str], path: pathlib.Path, **options
+) -> Cameras:
+    """`make_cameras`, of numbers that stay finite and rays that stay apart in float32.
+
+    Args:
+      poses: [V, 4, 4] camera-to-world.
+      intrinsics: [V, 4] fx, fy, cx, cy in pixels.
+      sizes: [V, 2] width, height in pixels.
+      names: [V] how to call the views in messages.
+      path: what gives the cameras, for messages.
+      **options: of `make_cameras`.
+
+    Raises:
+      SceneError: a number that float32 cannot hold, or a focal length that is as good as 0.
+    """
+    for name, pose, values in zip(names, poses, intrinsics):
+        largest = max(np.abs(pose).max(), np.abs(values).max())
+        if not largest <= LARGEST:  # nor NaN
+            raise SceneError(
+                f"{path}: {name}: pose, focal length or centre reach {largest:g}: give numbers "
+                f"of at most {LARGEST:g}"
+            )
+        if min(values[:2]) < SMALLEST_FOCAL:
+            raise SceneError(
+                f"{path}: {name}: focal length is {min(values[:2]):g} pixels: "
+                f"give at least {SMALLEST_FOCAL:g}"
+            )
+    return make_cameras(poses, intrinsics, sizes, **options)
 
 
 def check_places(poses: np.ndarray, path: pathlib.Path) -> None:
@@ -146,9 +172,11 @@ def check_places(poses: np.ndarray, path: pathlib.Path) -> None:
 def check_proportions(size, stated, image_path: pathlib.Path, path: pathlib.Path) -> None:
     """An image may be scaled down from the stated (width, height), but not cropped."""
     if abs(size[1] - stated[1] * size[0] / stated[0]) > SIZE_TOLERANCE:
+        turned = images.orientation(image_path) != 1
+        fix = "turn its pixels, as its EXIF orientation is not applied" if turned else "mend it"
         raise SceneError(
             f"{image_path}: image is {size[0]} x {size[1]}, not in proportion to w, h = "
-            f"{stated[0]:g} x {stated[1]:g} in {path.name}: mend the image or w, h"
+            f"{stated[0]:g} x {stated[1]:g} in {path.name}: {fix} or w, h"
         )
 
 
@@ -171,8 +199,8 @@ def check_target_width(target: int | None, width: int, path: pathlib.Path) -> in
 
 
 def view_name(file: pathlib.Path, root: pathlib.Path) -> str:
-    """A view's name: its file relative to the scene's folder, with forward slashes."""
-    return pathlib.PurePath(os.path.relpath(file, root)).as_posix()
+    """A view's name: its file relative to the scene's folder, with forward slashes, printable."""
+    return printable(pathlib.PurePath(os.path.relpath(file, root)).as_posix())
 
 
 def keep_existing(frames: list, files: list, path: pathlib.Path, *, strict: bool) -> list[int]:
@@ -194,12 +222,11 @@ def keep_existing(frames: list, files: list, path: pathlib.Path, *, strict: bool
     missing = [frame["file_path"] for frame, file in zip(frames, files) if file is None]
     if not missing:
         return kept
-    names = ", ".join(missing[:NAMES_IN_WARNING])
-    names += ", ..." if len(missing) > NAMES_IN_WARNING else ""
+    names = images.some_names(missing)
     fault = f"{path}: file_path: {len(missing)} of {len(frames)} images have no file ({names})"
     if strict:
         raise SceneError(f"{fault}: add them or load without strict")
     if not kept:
         raise SceneError(f"{fault}: the split is empty: add the images")
-    warnings.warn(f"{fault}: skipped", stacklevel=3)
+    images.warn(f"{fault}: skipped")
     return kept

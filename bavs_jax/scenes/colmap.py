@@ -7,37 +7,55 @@ import pathlib
 
 import numpy as np
 
-from bavs_jax.cameras import make_cameras
-from bavs_jax.scenes import checks, images, models
+from bavs_jax.scenes import checks, images, models, texts
 from bavs_jax.scenes.base import Scene, SceneError
 from bavs_jax.scenes.capture import Capture, make_scene
-from bavs_jax.scenes.colmap_files import check_binary, check_text
+from bavs_jax.scenes.colmap_files import check_binary, check_text, count_images
 from bavs_jax.scenes.folders import image_folder, match_names
 
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
+# Where models lie, each in a folder with a number or in this one itself.
+MODEL_PARENTS = ("sparse", "colmap/sparse", ".", "distorted/sparse")
+# Of photos before their distortion was taken out; their model is no fit for the photos in `images`.
+DISTORTED = ("distorted/sparse", "input")
 MODEL_FILES = ("cameras", "images", "points3D")
 
 
+def has_model(folder: pathlib.Path) -> bool:
+    """Whether a folder holds any of a model's files."""
+    return any((folder / f"{f}{s}").is_file() for f in MODEL_FILES[:2] for s in (".bin", ".txt"))
+
+
+def find_models(root: pathlib.Path) -> list[pathlib.Path]:
+    """The folders of a scene's sparse models, that of the most images first.
+
+    COLMAP's mapper leaves several where it could not join all photos. Models in `distorted`
+    come last.
+    """
+    folders = []
+    for name in MODEL_PARENTS:
+        parent = root / name
+        inner = sorted(parent.glob("*")) if name != "." and parent.is_dir() else []
+        folders += [folder for folder in (*inner, parent) if has_model(folder)]
+    distorted = root / DISTORTED[0]
+    return sorted(folders, key=lambda f: (f.is_relative_to(distorted), -count_images(f)))
+
+
 def find_model(root: pathlib.Path) -> pathlib.Path | None:
-    """The folder of a scene's sparse model: the first that holds any of its files, or None."""
-    for name in MODEL_FOLDERS:
-        folder = root / name
-        if any((folder / f"{f}{s}").is_file() for f in MODEL_FILES[:2] for s in (".bin", ".txt")):
-            return folder
-    return None
+    """The folder of a scene's sparse model of the most images, or None."""
+    return next(iter(find_models(root)), None)
 
 
 def read_model(root: pathlib.Path):
-    """A scene's sparse model: `(folder, pycolmap.Reconstruction)`.
+    """A scene's sparse model of the most images: `(folder, pycolmap.Reconstruction)`.
 
     Raises:
       SceneError: pycolmap is not installed, there is no model, or it cannot be read.
     """
-    folder = find_model(root)
+    folder, *others = find_models(root) or [None]
     if folder is None:
         raise SceneError(
             f"{root}: no COLMAP model (cameras.bin or cameras.txt) in "
-            f"{', '.join(MODEL_FOLDERS[:-1])}: copy COLMAP's sparse folder here"
+            f"{', '.join(p for p in MODEL_PARENTS if p != '.')}: copy COLMAP's sparse folder here"
         )
     suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
     for name in MODEL_FILES:
@@ -55,10 +73,16 @@ def read_model(root: pathlib.Path):
     try:
         (model.read_binary if suffix == ".bin" else model.read_text)(str(folder))
     except (ValueError, IndexError, RuntimeError) as error:
-        reason = images.one_line(error)
+        reason = texts.one_line(error)
         raise SceneError(
             f"{folder}: COLMAP model cannot be read ({reason}): make it anew"
         ) from error
+    if others:
+        left_out = [f"{f.relative_to(root)} with {count_images(f)}" for f in others]
+        images.warn(
+            f"{folder}: model taken, with {len(model.images)} images; left out: "
+            f"{images.some_names(left_out)}"
+        )
     return folder, model
 
 
@@ -126,7 +150,9 @@ def read_colmap(root: pathlib.Path, *, downscale: int | None, strict: bool) -> C
     for first, second in itertools.pairwise(names):
         if first == second:
             raise SceneError(f"{folder}: image '{first}' is a duplicate: remove one")
-    pictures = image_folder(root, downscale)
+    distorted, photos = (root / name for name in DISTORTED)
+    use_input = downscale is None and folder.is_relative_to(distorted) and photos.is_dir()
+    pictures = photos if use_input else image_folder(root, downscale)
     for name in names:
         checks.check_inside(pictures, name, folder, f"image '{name}'")
     found = match_names(names, pictures)
@@ -143,19 +169,37 @@ def read_colmap(root: pathlib.Path, *, downscale: int | None, strict: bool) -> C
         distortion.append(coefficients)
         sizes.append(size)
         lenses.append(lens)
-    lens = models.common_lens(lenses, [names[index] for index in kept], folder)
+    warn_without_pose(pictures, found, folder)
+    names = [names[index] for index in kept]
+    lens = models.common_lens(lenses, names, folder)
+    options = {"names": names, "path": folder, "distortion": distortion, "lens": lens}
     return Capture(
         root=root,
         source=folder,
         files=tuple(found[index] for index in kept),
         poses=np.stack(poses),
-        cameras=make_cameras(poses, intrinsics, sizes, distortion=distortion, lens=lens),
+        cameras=checks.build_cameras(poses, intrinsics, sizes, **options),
     )
+
+
+def warn_without_pose(pictures: pathlib.Path, found: list, folder: pathlib.Path) -> None:
+    """Warns of photos that the model has no pose for."""
+    posed = set(found)
+    photos = sorted(f for f in pictures.rglob("*") if f.suffix.lower() in images.IMAGE_SUFFIXES)
+    left = [checks.view_name(file, pictures) for file in photos if file not in posed]
+    if left:
+        images.warn(
+            f"{folder}: {len(left)} of {len(photos)} photos in {pictures.name} have no pose "
+            f"({images.some_names(left)}): left out"
+        )
 
 
 @checks.name_refusals
 def load_colmap(root, *, downscale: int | None = None, strict: bool = False, **options) -> Scene:
-    """Loads a COLMAP model, text or binary, from `sparse/0`, `sparse` or `colmap/sparse/0`.
+    """Loads a COLMAP model, text or binary, from `sparse/*`, `sparse` or `colmap/sparse/*`.
+
+    Of several models that of the most images; a warning names the others, and photos without a
+    pose. Without any of these, that in `distorted/sparse`, with the photos in `input`.
 
     Args:
       root: the folder of `sparse` and `images`.

@@ -7,9 +7,13 @@ neither the file nor the line of a fault in a text file.
 from __future__ import annotations
 
 import math
+import mmap
+import os
 import pathlib
 import struct
+from collections.abc import Iterator
 
+from bavs_jax.scenes import texts
 from bavs_jax.scenes.base import SceneError
 
 # Each model's number of parameters by its number in binary files; the first eleven of COLMAP.
@@ -17,6 +21,7 @@ NUM_PARAMETERS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12, 7: 5, 8: 4, 9: 5, 1
 CAMERA_HEAD = "<IiQQ"  # id, model, width, height
 IMAGE_HEAD = "<I7dI"  # id, quaternion, translation, camera
 POINT_HEAD = "<Q3d3Bd"  # id, place, colour, error
+MAX_TEXT_BYTES = 1 << 28
 UNIT_TOLERANCE = 1e-2  # quaternions may be written with few digits
 POINT2D_BYTES, TRACK_BYTES = 24, 8
 SENSOR_BYTES, POSE_BYTES, DATA_ID_BYTES = 8, 56, 16
@@ -28,7 +33,10 @@ class Bytes:
     """A binary file that is walked through from its start; its end must not come early."""
 
     def __init__(self, path: pathlib.Path):
-        self.path, self.data, self.place = path, path.read_bytes(), 0
+        self.path, self.data, self.place = path, b"", 0
+        with path.open("rb") as file:
+            if os.fstat(file.fileno()).st_size:  # mapped: of a large file little is looked at
+                self.data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
     def take(self, layout: str) -> tuple:
         self.skip(struct.calcsize(layout))
@@ -44,10 +52,14 @@ class Bytes:
 
     def text(self) -> str:
         """A name that ends with a zero byte."""
-        end = self.data.find(b"\0", self.place)
-        start = self.place
+        start, end = self.place, self.data.find(b"\0", self.place)
         self.skip((len(self.data) if end < 0 else end) - start + 1)
-        return self.data[start:end].decode("utf-8", "replace")
+        try:
+            return self.data[start:end].decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise SceneError(
+                f"{self.path}: the name at byte {start} is not UTF-8: rename the image"
+            ) from error
 
     def finish(self) -> None:
         if self.place != len(self.data):
@@ -128,13 +140,22 @@ def check_camera(camera: int, cameras: set[int], path: pathlib.Path, name: str) 
         )
 
 
-def text_lines(path: pathlib.Path) -> list[tuple[int, str]]:
+def text_lines(path: pathlib.Path) -> Iterator[tuple[int, str]]:
     """Numbered lines of a text file, without its comments."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise SceneError(f"{path}: not UTF-8 text ({error.reason}): save it as UTF-8") from error
-    return [(n, line) for n, line in enumerate(lines, start=1) if not line.startswith("#")]
+    texts.check_size(path, MAX_TEXT_BYTES, "write the model in binary form")
+    return ((n, line) for n, line in texts.text_lines(path) if not line.startswith("#"))
+
+
+def count_images(folder: pathlib.Path) -> int:
+    """How many registered images a model says that it has; 0 where it lacks their file."""
+    binary, text = folder / "images.bin", folder / "images.txt"
+    if binary.is_file():
+        with binary.open("rb") as file:
+            head = file.read(8)
+        return struct.unpack("<Q", head)[0] if len(head) == 8 else 0
+    if not text.is_file():
+        return 0
+    return sum(1 for _ in text_lines(text)) // 2  # two lines an image
 
 
 def check_numbers(words: list[str], path: pathlib.Path, line: int, fields: str) -> list[float]:
@@ -167,7 +188,7 @@ def check_text(folder: pathlib.Path) -> None:
         cameras.add(int(check_numbers([words[0], *words[2:]], path, line, fields)[0]))
 
     path, seen = folder / "images.txt", {}
-    lines = iter(text_lines(path))
+    lines = text_lines(path)
     for line, content in lines:
         words = content.split(maxsplit=9)
         if not words:

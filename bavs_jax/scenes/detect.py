@@ -33,6 +33,7 @@ def has_kind(root: pathlib.Path, kind: str) -> bool:
     raise ValueError(f"kind {kind!r} is unknown")
 
 
+@checks.name_refusals
 def detect_kind(root) -> str:
     """The loader for a folder: the first that fits of those that say most about a scene.
 
@@ -59,6 +60,7 @@ def detect_kind(root) -> str:
     raise SceneError(f"{root}: no known layout: looked for {LOOKED_FOR}: check the path")
 
 
+@checks.name_refusals
 def check_kind(root, kind: str) -> None:
     """A folder must hold the kind of scene that it is loaded as.
 

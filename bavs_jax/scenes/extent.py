@@ -8,6 +8,7 @@ import numpy as np
 
 from bavs_jax.cameras import Cameras, pixel_rays
 from bavs_jax.scenes.base import SceneError
+from bavs_jax.scenes.checks import LARGEST
 from bavs_jax.scenes.maps import GRAZING
 
 NEAR = 0.05  # scene units
@@ -47,14 +48,14 @@ def scene_extent(
         default_far = float(bounds.max() * np.linalg.norm(corners, axis=-1).max())
     near = default_near if near is None else near
     far = default_far if far is None else far
-    if not 0.0 < near < far < np.inf:
+    if not 1.0 / LARGEST <= near < far <= LARGEST:  # nor NaN
         raise SceneError(f"{path}: near {near:g}, far {far:g}: give 0 < near < far")
     return near, far, box
 
 
 def cube(half_side: float, path: pathlib.Path) -> np.ndarray:
     """A box [2, 3] around the origin."""
-    if not 0.0 < half_side < np.inf:
+    if not 1.0 / LARGEST <= half_side <= LARGEST:
         raise SceneError(f"{path}: box_half_side {half_side}: give a number above 0")
     return half_side * np.array([[-1.0] * 3, [1.0] * 3], np.float32)
 

@@ -1,34 +1,54 @@
-"""Image files to arrays: reading, area-averaged down-scaling, compositing over a background."""
+"""Image files to arrays: reading, area-averaged down-scaling, compositing over a background.
+
+Pixels are taken as they are stored, whatever a file's EXIF orientation says: that is how COLMAP
+and nerfstudio read them, so their poses and intrinsics belong to the stored pixels. Such files are
+named in a warning (`look_over`), since poses from elsewhere may belong to the turned picture.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import os
 import pathlib
+import warnings
+from collections import defaultdict
+from collections.abc import Iterator
 
 import imageio.v3 as iio
 import numpy as np
 from PIL import Image
 
-from bavs_jax.scenes.base import SceneError
+from bavs_jax.scenes.base import SceneError, printable
+from bavs_jax.scenes.texts import is_file, one_line
 
 # What a name without a suffix may mean; some cameras write capitals.
 SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")  # of what counts as an image in a folder
-# What Pillow raises on damaged files, and on images of absurd size.
-DAMAGE = (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError)
-MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "I;16", "I;16B", "I")
+# Pillow knows many more, and some of them start other programs (EPS: Ghostscript),
+# and turns TIFF by its orientation.
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP")
+MAX_PIXELS = 100_000_000  # of one image
+MODES = ("1", "L", "LA", "P", "RGB", "RGBA", "I;16", "I")
+STRIP = 1 << 21  # pixels in float64 at a time
+ORIENTATION = 0x0112  # the tag's number in EXIF
+NAMES_IN_WARNING = 3
 
 
 def find_image(root: pathlib.Path, file_path: str) -> pathlib.Path | None:
-    """The image that a frame's `file_path` means, or None."""
-    for suffix in SUFFIXES:
-        path = root / f"{file_path}{suffix}"
-        if path.is_file():
-            return path
-    for suffix in SUFFIXES:
-        path = root / f"{file_path}{suffix}"
-        if path.is_dir():
-            raise SceneError(f"{path}: is a folder: put an image file in its place")
-    return None
+    """The image that a frame's `file_path` means, or None.
+
+    The name itself, else with a suffix added, else with its own suffix in the other case.
+    """
+    stem, suffix = pathlib.PurePosixPath(file_path), pathlib.PurePosixPath(file_path).suffix
+    names = [f"{file_path}{added}" for added in SUFFIXES]
+    if suffix:
+        names += [str(stem.with_suffix(s)) for s in (suffix.lower(), suffix.upper())]
+    paths = [root / name for name in names]
+    found = next((path for path in paths if is_file(path)), None)
+    if found is None and (folder := next((path for path in paths if os.path.isdir(path)), None)):
+        raise SceneError(f"{folder}: is a folder: put an image file in its place")
+    return found
 
 
 def list_images(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -39,44 +59,87 @@ def list_images(folder: pathlib.Path) -> list[pathlib.Path]:
     return files
 
 
-def one_line(error: Exception) -> str:
-    """A foreign error's message without its line breaks."""
-    return " ".join(str(error).split())
+@contextlib.contextmanager
+def open_image(path: pathlib.Path) -> Iterator[Image.Image]:
+    """An image file whose header is read and whose pixels are not decoded yet.
+
+    Raises:
+      SceneError: the file is missing, damaged, of a format that is not one of `FORMATS`, of more
+        than `MAX_PIXELS` or of several pictures; or what the block does with it fails.
+    """
+    if not is_file(path):
+        raise SceneError(f"{path}: image is missing: add the file or remove its frame")
+    try:
+        with warnings.catch_warnings():
+            # Of large images, which are bounded here, and of odd tags, which are not read.
+            warnings.filterwarnings("ignore", module=r"PIL\.")
+            with Image.open(path, formats=FORMATS) as image:
+                check_extent(image, path)
+                yield image
+    except SceneError:
+        raise
+    except Image.DecompressionBombError as error:
+        raise SceneError(
+            f"{path}: image cannot be read ({one_line(error)}): reduce it to "
+            f"{MAX_PIXELS // 10**6} million pixels"
+        ) from error
+    except Image.UnidentifiedImageError as error:
+        raise SceneError(
+            f"{path}: image cannot be read (it is none of {', '.join(FORMATS)}): "
+            "save it again as PNG or JPEG"
+        ) from error
+    except Exception as error:  # of many kinds: Pillow lets through what its decoders raise
+        raise SceneError(
+            f"{path}: image cannot be read ({one_line(error)}): save it again"
+        ) from error
+
+
+def check_extent(image: Image.Image, path: pathlib.Path) -> None:
+    """An image must be a single picture of at most `MAX_PIXELS`."""
+    width, height = image.size
+    if width * height > MAX_PIXELS:
+        raise SceneError(
+            f"{path}: image is {width} x {height}, {width * height / 1e6:.0f} million pixels: "
+            f"reduce it to {MAX_PIXELS // 10**6}"
+        )
+    num = getattr(image, "n_frames", 1)
+    if num > 1 and image.format != "MPO":  # a phone's JPEG, whose first picture is the photo
+        raise SceneError(
+            f"{path}: image holds {num} pictures, as an animation does: save one of them"
+        )
 
 
 def decode(path: pathlib.Path) -> np.ndarray:
     """An image file's values as they are stored, of a colour model that is known."""
-    try:
-        with iio.imopen(path, "r", plugin="pillow") as file:
-            mode = file.metadata(exclude_applied=False).get("mode")
-            image = file.read()
-    except DAMAGE as error:
-        raise SceneError(
-            f"{path}: image cannot be read ({one_line(error)}): save it again"
-        ) from error
-    if mode not in MODES:
-        raise SceneError(f"{path}: image has colour model {mode}: save it as 8-bit RGB or RGBA")
-    if image.dtype == bool:
-        return image.astype(np.uint8) * 255
-    if mode == "I" and image.min() >= 0 and image.max() < 1 << 16:  # 16-bit PNG in older Pillow
-        return image.astype(np.uint16)
-    return image
+    with open_image(path) as image:
+        if image.mode not in MODES:
+            raise SceneError(
+                f"{path}: image has colour model {image.mode}: save it as 8-bit RGB or RGBA"
+            )
+        mode = image.mode
+        if mode == "P":  # imageio fails at palettes with transparency
+            values = np.array(image.convert("RGBA" if image.has_transparency_data else "RGB"))
+        else:
+            values = iio.imread(path, index=0, plugin="pillow")  # of a phone's MPO the photo
+    if values.dtype == bool:
+        return values.astype(np.uint8) * 255
+    if mode == "I" and values.min() >= 0 and values.max() < 1 << 16:  # 16-bit PNG in older Pillow
+        return values.astype(np.uint16)
+    return values
 
 
 def read_image(path: pathlib.Path) -> np.ndarray:
-    """Reads an image file as straight sRGB values.
+    """Reads an image file as straight sRGB values, its pixels as they are stored.
 
     Args:
-      path: a PNG, JPEG or other format that imageio reads.
+      path: a file in one of `FORMATS`.
 
     Returns:
       [H, W, C] uint8 with C = 3, or 4 where the file has alpha.
 
     Raises:
-      SceneError: the file is missing, damaged or of an unknown format.
+      SceneError: see `open_image`; or values that are no 8-bit or 16-bit colour.
     """
-    if not path.is_file():
-        raise SceneError(f"{path}: image is missing: add the file or remove its frame")
     image = decode(path)
     if image.dtype == np.uint16:
         image = (image // 257).astype(np.uint8)
@@ -93,16 +156,70 @@ def read_image(path: pathlib.Path) -> np.ndarray:
 
 
 def image_size(path: pathlib.Path) -> tuple[int, int]:
-    """Width and height of an image file in pixels, from its header alone."""
-    if not path.is_file():
-        raise SceneError(f"{path}: image is missing: add the file or remove its frame")
-    try:
-        height, width = iio.improps(path, plugin="pillow").shape[:2]
-    except DAMAGE as error:
-        raise SceneError(
-            f"{path}: image cannot be read ({one_line(error)}): save it again"
-        ) from error
-    return width, height
+    """Width and height of an image file in pixels as they are stored, from its header alone."""
+    with open_image(path) as image:
+        return image.size
+
+
+def orientation(path: pathlib.Path) -> int:
+    """How a viewer would turn an image, by its EXIF tag: 1 to 8; 1, upright, where it has none."""
+    with open_image(path) as image:
+        if image.format == "PNG" and "exif" not in image.info:
+            return 1  # Pillow would decode all of it to look for a tag at the end
+        try:
+            value = image.getexif().get(ORIENTATION, 1)
+        except Exception:  # a damaged block of EXIF says nothing of the pixels
+            return 1
+    return value if value in range(1, 9) else 1
+
+
+def look_over(files: list[pathlib.Path], root: pathlib.Path, path: pathlib.Path) -> None:
+    """Warns of photos that carry an EXIF orientation, and of photos that are copies of others.
+
+    Args:
+      files: the photos of a scene.
+      root: the scene's folder.
+      path: what gives their poses, for messages.
+    """
+    names = {file: os.path.relpath(file, root) for file in files}
+    turned = [names[file] for file in files if orientation(file) != 1]
+    if turned:
+        warn(
+            f"{path}: {len(turned)} of {len(files)} photos have an EXIF orientation "
+            f"({some_names(turned)}): it is not applied, as in COLMAP and nerfstudio; if the poses "
+            "belong to the turned pictures, turn the files' pixels"
+        )
+    same = [f"{names[first]} = {names[second]}" for first, second in copies(files)]
+    if same:
+        warn(
+            f"{path}: {len(same)} of {len(files)} photos are copies of others "
+            f"({some_names(same)}): each counts as a view of its own; remove one of each pair"
+        )
+
+
+def copies(files: list[pathlib.Path]) -> list[tuple[pathlib.Path, pathlib.Path]]:
+    """Pairs of files with the same content: each later one with the first."""
+    by_size, first, pairs = defaultdict(list), {}, []
+    for file in files:
+        by_size[file.stat().st_size].append(file)
+    for group in by_size.values():
+        for file in group if len(group) > 1 else ():
+            with file.open("rb") as content:
+                digest = hashlib.file_digest(content, "sha256").digest()
+            if first.setdefault(digest, file) != file:
+                pairs.append((first[digest], file))
+    return pairs
+
+
+def some_names(names: list[str]) -> str:
+    """The first few of some names."""
+    more = ", ..." if len(names) > NAMES_IN_WARNING else ""
+    return ", ".join(names[:NAMES_IN_WARNING]) + more
+
+
+def warn(message: str) -> None:
+    """A warning of one line, whatever the names of files hold."""
+    warnings.warn(printable(message), stacklevel=3)
 
 
 def box_filter(image: np.ndarray, size: int) -> np.ndarray:
@@ -158,6 +275,21 @@ def nearest_resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return image[row[:, None], column[None, :]]
 
 
+def strips(num: int, across: int) -> list[slice]:
+    """Slices of `num` rows, each `across` pixels long, that hold some `STRIP` pixels each."""
+    step = max(STRIP // across, 1)
+    return [slice(start, min(start + step, num)) for start in range(0, num, step)]
+
+
+def premultiplied(image: np.ndarray) -> np.ndarray:
+    """[H, W, 3 or 4] uint8 as float64 in [0, 1], colour times alpha where there is alpha."""
+    values = image / 255.0
+    if image.shape[-1] == 4:
+        for channel in range(3):  # three times as fast as all at once
+            values[..., channel] *= values[..., 3]
+    return values
+
+
 def shrink_over(image: np.ndarray, width: int, height: int, background) -> np.ndarray:
     """An image at a smaller size over a background colour, as it enters the pixel table.
 
@@ -173,15 +305,22 @@ def shrink_over(image: np.ndarray, width: int, height: int, background) -> np.nd
     Returns:
       [height, width, 3] uint8, rounded to nearest, and where there is alpha the opacity
       [height, width] uint8, else None.
+
+    Numerics: float64 in strips of columns, then of rows; a whole photo would take 32 bytes a pixel.
     """
-    values = image / 255.0
-    if image.shape[-1] == 3:
-        return _as_bytes(area_resize(values, width, height)), None
-    values[..., :3] *= values[..., 3:]
-    small = area_resize(values, width, height)
-    colour = small[..., :3] + (1.0 - small[..., 3:]) * np.asarray(background)
-    return _as_bytes(colour), _as_bytes(small[..., 3])
-
-
-def _as_bytes(values: np.ndarray) -> np.ndarray:
-    return np.rint(np.clip(values, 0.0, 1.0) * 255.0).astype(np.uint8)
+    same = image.shape[:2] == (height, width)
+    if not same:  # in the order of `area_resize`
+        short = np.empty((height, *image.shape[1:]))
+        for columns in strips(image.shape[1], image.shape[0]):
+            short[:, columns] = box_filter(premultiplied(image[:, columns]), height)
+    parts = []
+    for rows in strips(height, image.shape[1]):
+        if same:
+            values = premultiplied(image[rows])
+        else:
+            values = box_filter(short[rows].swapaxes(0, 1), width).swapaxes(0, 1)
+        if image.shape[-1] == 4:
+            values[..., :3] += (1.0 - values[..., 3:]) * np.asarray(background)
+        parts.append(np.rint(np.clip(values, 0.0, 1.0) * 255.0).astype(np.uint8))
+    small = np.concatenate(parts)
+    return small[..., :3], small[..., 3] if image.shape[-1] == 4 else None

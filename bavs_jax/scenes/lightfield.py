@@ -11,7 +11,7 @@ import functools
 import pathlib
 from typing import NamedTuple
 
-from bavs_jax.scenes import checks, maps, nerfplusplus
+from bavs_jax.scenes import checks, maps, nerfplusplus, texts
 from bavs_jax.scenes.base import Scene, SceneError
 from bavs_jax.scenes.capture import Capture, make_scene
 from bavs_jax.scenes.colmap import find_model, read_colmap
@@ -71,8 +71,9 @@ def true_depths(root: pathlib.Path, capture: Capture, test) -> tuple:
     path = root / "scale_parameters.txt"
     if not path.is_file():
         raise SceneError(f"{path}: file is missing: add it, it scales the depth_gt files")
+    text = texts.read_text(path).strip()
     try:
-        scale = float(path.read_text(encoding="utf-8").strip())
+        scale = float(text)
     except ValueError as error:
         raise SceneError(f"{path}: is no number: write the scale of depth_gt") from error
     unit = 1.0 / checks.check_number(scale, path, "scale", positive=True)

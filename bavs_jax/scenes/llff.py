@@ -6,8 +6,7 @@ import pathlib
 
 import numpy as np
 
-from bavs_jax.cameras import make_cameras
-from bavs_jax.scenes import checks, images, maps, models
+from bavs_jax.scenes import checks, images, models, texts
 from bavs_jax.scenes.base import Scene, SceneError
 from bavs_jax.scenes.capture import Capture, make_scene
 from bavs_jax.scenes.folders import image_folder
@@ -19,7 +18,7 @@ COLUMNS = 17  # a 3 x 5 matrix [down, right, back, position, (height, width, foc
 
 def read_poses_bounds(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Poses in OpenGL axes [V, 4, 4], `(height, width, focal)` [V, 3] and bounds [V, 2]."""
-    table = maps.read_array(path).astype(np.float64)
+    table = texts.read_array(path).astype(np.float64)
     if table.ndim != 2 or table.shape[1] != COLUMNS or not len(table):
         raise SceneError(
             f"{path}: has shape {list(table.shape)}: give [views, {COLUMNS}]: "
@@ -36,7 +35,7 @@ def read_poses_bounds(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, np.nd
         )
         sizes.append((height, width, focal))
         near, far = row[15:]
-        if not 0.0 < near < far < np.inf:
+        if not 1.0 / checks.LARGEST <= near < far <= checks.LARGEST:  # nor NaN
             raise SceneError(f"{path}: row {view}: bounds {near:g}, {far:g}: give 0 < near < far")
     return np.stack(poses), np.array(sizes), table[:, 15:]
 
@@ -67,7 +66,9 @@ def read_llff(root: pathlib.Path, *, downscale: int | None) -> Capture:
         source=path,
         files=tuple(files),
         poses=poses,
-        cameras=make_cameras(poses, intrinsics, sizes),
+        cameras=checks.build_cameras(
+            poses, intrinsics, sizes, names=[file.name for file in files], path=path
+        ),
         bounds=bounds,
         split=every_nth(len(files), TEST_EVERY, path=path),
     )

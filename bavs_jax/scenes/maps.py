@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from bavs_jax.cameras import Cameras, image_pixels, pixel_rays, take
-from bavs_jax.scenes import checks, images
+from bavs_jax.scenes import checks, images, texts
 from bavs_jax.scenes.base import SceneError
 
 GRAZING = 1e-3  # cosine to the optical axis below which a depth along it says nothing
@@ -73,7 +73,7 @@ def read_depth(
             f"{path}: depth of {image_path.name} is missing: add it or drop its depth_file_path"
         )
     if path.suffix == ".npy":
-        depth = read_array(path)
+        depth = texts.read_array(path)
     else:
         depth = images.decode(path)
         if depth.dtype != np.uint16:
@@ -87,26 +87,16 @@ def read_depth(
             f"{path}: depth is {depth.shape[1]} x {depth.shape[0]} but {image_path.name} is "
             f"{size[0]} x {size[1]}: use the same proportions"
         )
-    depth = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32) * np.float32(unit)
+    depth = np.where(np.isfinite(depth), depth, 0.0)
+    largest = max(unit, 1.0) * float(max(depth.max(), -depth.min()))
+    if largest > checks.LARGEST:
+        raise SceneError(
+            f"{path}: depth reaches {largest:g}: give at most {checks.LARGEST:g}, 0 for unknown"
+        )
+    depth = depth.astype(np.float32) * np.float32(unit)
     if depth.min() < 0.0:
         raise SceneError(f"{path}: depth is negative ({depth.min():g}): use 0 for unknown")
     return depth
-
-
-def read_array(path: pathlib.Path) -> np.ndarray:
-    """A numeric array from an .npy file."""
-    if not path.is_file():
-        raise SceneError(f"{path}: file is missing: check the scene's folder")
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        reason = images.one_line(error)
-        raise SceneError(
-            f"{path}: array cannot be read ({reason}): save it with np.save"
-        ) from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-        raise SceneError(f"{path}: holds no array of numbers: save it with np.save")
-    return array
 
 
 @functools.cache

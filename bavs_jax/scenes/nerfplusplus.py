@@ -6,8 +6,7 @@ import pathlib
 
 import numpy as np
 
-from bavs_jax.cameras import make_cameras
-from bavs_jax.scenes import checks, images
+from bavs_jax.scenes import checks, images, texts
 from bavs_jax.scenes.base import SceneError
 from bavs_jax.scenes.capture import Capture
 
@@ -23,8 +22,9 @@ def read_matrix(path: pathlib.Path) -> np.ndarray:
     """A 4 x 4 matrix written as 16 numbers."""
     if not path.is_file():
         raise SceneError(f"{path}: file is missing: every image needs one of its name")
+    words = texts.read_text(path).split()
     try:
-        values = np.array(path.read_text(encoding="utf-8").split(), np.float64)
+        values = np.array(words, np.float64)
     except ValueError as error:
         raise SceneError(f"{path}: holds what is no number: write 16 numbers") from error
     if values.size != 16:
@@ -69,6 +69,8 @@ def read_nerfplusplus(root: pathlib.Path) -> Capture:
         source=root,
         files=tuple(files),
         poses=np.stack(poses),
-        cameras=make_cameras(poses, intrinsics, sizes),
+        cameras=checks.build_cameras(
+            poses, intrinsics, sizes, names=[checks.view_name(f, root) for f in files], path=root
+        ),
         split=tuple(split),
     )

@@ -7,7 +7,7 @@ import pathlib
 
 import numpy as np
 
-from bavs_jax.scenes import checks, images, maps
+from bavs_jax.scenes import checks, images, maps, texts
 from bavs_jax.scenes.base import Scene, SceneError
 from bavs_jax.scenes.capture import Capture, make_scene
 from bavs_jax.scenes.folders import check_downscale, scaled_names
@@ -41,9 +41,11 @@ def find_masks(root: pathlib.Path, frames: list[Frame], downscale: int | None) -
                 "a mask, or none"
             )
         checks.check_inside(root, name, frame.path, field)
-    scaled = (scaled_names(name, downscale, kind="masks") for name in named)
-    candidates = ([root / n for n in names] for names in scaled)
-    return tuple(next((p for p in paths if p.is_file()), paths[0]) for paths in candidates)
+    return tuple(
+        find_scaled(root, name, downscale, kind="masks")
+        or root / scaled_names(name, downscale, kind="masks")[0]
+        for name in named
+    )
 
 
 def find_depths(
@@ -126,7 +128,7 @@ def read_nerfstudio(
 ) -> Capture:
     """Reads `transforms.json`; the arguments are those of `load_nerfstudio`."""
     path = root / "transforms.json"
-    data = checks.read_json(path)
+    data = texts.read_json(path)
     listed = checks.check_frames(data, path)
     check_downscale(root, downscale)
     for index, frame in enumerate(listed):

@@ -20,6 +20,8 @@ def rotation_between(source, target) -> np.ndarray:
     Args:
       source: [3] not 0.
       target: [3] not 0.
+
+    Numerics: near opposite directions `1 + c` is `v . v / (1 - c)`, which does not cancel.
     """
     source = np.asarray(source, np.float64) / np.linalg.norm(source)
     target = np.asarray(target, np.float64) / np.linalg.norm(target)
@@ -31,7 +33,8 @@ def rotation_between(source, target) -> np.ndarray:
         axis /= np.linalg.norm(axis)
         return 2.0 * np.outer(axis, axis) - np.eye(3)
     skew = np.array([[0, -cross[2], cross[1]], [cross[2], 0, -cross[0]], [-cross[1], cross[0], 0]])
-    return np.eye(3) + skew + skew @ skew / (1.0 + cos)
+    rest = 1.0 + cos if cos > -0.5 else cross @ cross / (1.0 - cos)
+    return np.eye(3) + skew + skew @ skew / rest
 
 
 def level_and_scale(poses: np.ndarray, *, scale: float | None = None) -> np.ndarray:

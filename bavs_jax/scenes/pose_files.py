@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import csv
-import json
+import os
 import pathlib
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bavs_jax.scenes import texts
 from bavs_jax.scenes.base import SceneError
+from bavs_jax.scenes.checks import LARGEST
 
 QUATERNION_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 ORTHONORMAL_TOLERANCE = 1e-3  # of R R^T from the identity; files hold few digits
@@ -25,22 +27,18 @@ def read_pose_file(path) -> np.ndarray:
     Raises:
       SceneError: anything that is no pose; it names the entry.
     """
-    path = pathlib.Path(path).expanduser()
+    path = pathlib.Path(os.path.expanduser(path))
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        entries = _json_entries(path) if path.suffix.lower() == ".json" else _csv_entries(path)
+    except OSError as error:
         raise SceneError(f"{path}: cannot be read ({error}): give a JSON or CSV file") from error
-    entries = _json_entries(text, path) if path.suffix == ".json" else _csv_entries(text, path)
     if not entries:
         raise SceneError(f"{path}: holds no pose: list at least one")
     return np.stack([_pose(entry, f"{path}: {name}") for name, entry in entries])
 
 
-def _json_entries(text: str, path: pathlib.Path) -> list[tuple[str, object]]:
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise SceneError(f"{path}: is no JSON ({error}): mend the file") from error
+def _json_entries(path: pathlib.Path) -> list[tuple[str, object]]:
+    data = texts.parse_json(path)
     if isinstance(data, dict):
         frames = data.get("frames")
         if not isinstance(frames, list):
@@ -57,8 +55,12 @@ def _json_entries(text: str, path: pathlib.Path) -> list[tuple[str, object]]:
     return [(f"entry {i}", entry) for i, entry in enumerate(data)]
 
 
-def _csv_entries(text: str, path: pathlib.Path) -> list[tuple[str, object]]:
-    rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
+def _csv_entries(path: pathlib.Path) -> list[tuple[str, object]]:
+    lines = texts.read_text(path).splitlines()
+    try:
+        rows = [row for row in csv.reader(lines) if any(cell.strip() for cell in row)]
+    except csv.Error as error:  # a field longer than the 131,072 characters that csv allows
+        raise SceneError(f"{path}: is no CSV ({error}): mend the file") from error
     if not rows:
         return []
     head = [cell.strip() for cell in rows[0]]
@@ -90,7 +92,7 @@ def _pose(entry, where: str) -> np.ndarray:
             pose = np.array(entry, np.float64)
     except KeyError as error:
         raise SceneError(f"{where}: {error.args[0]}: missing: give a number") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         if isinstance(error, SceneError):
             raise
         raise SceneError(f"{where}: is no pose ({error}): give numbers only") from error
@@ -99,6 +101,9 @@ def _pose(entry, where: str) -> np.ndarray:
     pose = pose[:3]
     if not np.isfinite(pose).all():
         raise SceneError(f"{where}: holds a number that is not finite: give finite numbers")
+    largest = np.abs(pose).max()
+    if largest > LARGEST:
+        raise SceneError(f"{where}: holds {largest:g}: give numbers of at most {LARGEST:g}")
     rotation = pose[:, :3]
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if off > ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0.0:

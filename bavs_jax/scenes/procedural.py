@@ -24,6 +24,7 @@ SOURCE_VERSION = 3  # raise it when the look of the scene changes: caches are th
 CAMERA_RADIUS = 3.2  # scene units
 FIELD_OF_VIEW = 0.64  # radians across the width; holds the whole object from every side
 BACKGROUND = (1.0, 1.0, 1.0)
+MAX_PIXELS = 1 << 28  # of all views; each takes some 40 bytes on the way
 SUBSAMPLES = 3  # per pixel and axis
 CONE_CHUNK = 1 << 14  # pixels per call; a last chunk that is not full costs as much
 RAY_CHUNK = 1 << 11  # pixels per call, each with SUBSAMPLES**2 rays
@@ -92,7 +93,7 @@ def first_touch(cameras: Cameras, pixels: jax.Array):
 
 
 def photograph(cameras: Cameras, pixels: jax.Array, t_start: jax.Array, spread: jax.Array):
-    """Red, green, blue and opacity [N] in [0, 1], means over a pixel, and depth [N] at its centre."""
+    """Red, green, blue, opacity [N] in [0, 1], means over a pixel, and depth [N] at its centre."""
     offsets = subpixel_offsets()
     num, sub = pixels.shape[0], offsets.shape[0]
     places = (offsets[:, None, :] + pixels[None]).reshape(-1, 2)
@@ -158,7 +159,7 @@ class Photos(NamedTuple):
 
     pixels: np.ndarray  # [N, 3] uint8 sRGB over white, each the mean of 3 x 3 rays
     alpha: np.ndarray  # [N] uint8 share of these rays that meet the sculpture
-    depth: np.ndarray  # [N] float32 distance along the ray through the centre, 0 where it meets none
+    depth: np.ndarray  # [N] float32 along the ray through the centre, 0 where it meets nothing
 
 
 def capture(cameras: Cameras) -> Photos:
@@ -253,15 +254,24 @@ def load_procedural(
       The scene, with depth for all views.
 
     Raises:
-      SceneError: a size or count below 1.
+      SceneError: a size or count below 1, a seed below 0, or more than `MAX_PIXELS` in all.
     """
-    for field, value in (
-        ("image_size", image_size),
-        ("num_train", num_train),
-        ("num_test", num_test),
+    for field, value, least in (
+        ("image_size", image_size, 1),
+        ("num_train", num_train, 1),
+        ("num_test", num_test, 1),
+        ("seed", seed, 0),
     ):
-        if value < 1:
-            raise SceneError(f"procedural: {field}: is {value}: give at least 1")
+        if isinstance(value, bool) or not isinstance(value, int | np.integer):
+            raise SceneError(f"procedural: {field}: is {value!r}: give a whole number")
+        if not least <= value < 1 << 32:
+            raise SceneError(f"procedural: {field}: is {value}: give at least {least}, below 2^32")
+    num_pixels = (num_train + num_test) * image_size**2
+    if num_pixels > MAX_PIXELS:
+        raise SceneError(
+            f"procedural: image_size, num_train, num_test: ask for {num_pixels / 1e6:.0f} million "
+            f"pixels: stay below {MAX_PIXELS / 1e6:.0f}"
+        )
     key_train, key_test = jax.random.split(jax.random.key(seed))
     train = hemisphere_cameras(key_train, num_train, image_size=image_size)
     test = hemisphere_cameras(key_test, num_test, image_size=image_size)
@@ -273,10 +283,13 @@ def load_procedural(
         arguments = [SOURCE_VERSION, image_size, num_train, num_test, seed]
         digest = hashlib.sha256(json.dumps(arguments).encode()).hexdigest()[:16]
         path = pathlib.Path(cache_dir).expanduser() / f"procedural-{digest}.npz"
-        cached = read_cache(path, num_views * image_size**2)
+        cached = read_cache(path, num_pixels)
     photos = capture(cameras) if cached is None else cached
     if path is not None and cached is None:
-        write_cache(path, photos)
+        try:
+            write_cache(path, photos)
+        except OSError as error:  # such as a full disk
+            warnings.warn(f"{path}: cannot be written ({error.strerror})", stacklevel=2)
 
     return Scene(
         name="procedural",

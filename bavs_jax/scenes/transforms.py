@@ -7,7 +7,7 @@ import pathlib
 
 import numpy as np
 
-from bavs_jax.cameras import Cameras, make_cameras
+from bavs_jax.cameras import Cameras
 from bavs_jax.scenes import checks, images, models
 from bavs_jax.scenes.base import SceneError
 
@@ -102,4 +102,5 @@ def read_cameras(frames: list[Frame], files: list[pathlib.Path]) -> tuple[Camera
         lenses.append(lens_of(frame, distortion[-1]))
     names = [frame.own["file_path"] for frame in frames]
     lens = models.common_lens(lenses, names, frames[0].path)
-    return make_cameras(poses, intrinsics, sizes, distortion=distortion, lens=lens), np.stack(poses)
+    options = {"names": names, "path": frames[0].path, "distortion": distortion, "lens": lens}
+    return checks.build_cameras(poses, intrinsics, sizes, **options), np.stack(poses)

@@ -87,11 +87,14 @@ def select_batch(
 def make_select_batch_fn(k: int) -> Callable:
     """Jits `select_batch` for one batch size: filter and top-k in one function of fixed shapes.
 
+    Runs take `acquire`: the same two steps compiled apart, since scores cost something and only
+    those of the survivors are made, in between.
+
     Returns:
       `select_batch_fn(scores [C], ctx, *, radii=None) -> (selected [k], survivors [C],
-      FilterInfo)`, for scores that are at hand for all candidates; `acquire` is for those that
-      cost something. It raises SelectionError if a score in `ctx.mask` is NaN, or if k is more
-      than `ctx.mask` has; `radii` default to `default_radii`.
+      FilterInfo)`, for scores that are at hand for all candidates. It raises SelectionError if a
+      score in `ctx.mask` is NaN, or if k is more than `ctx.mask` has; `radii` default to
+      `default_radii`.
     """
     jitted = jax.jit(select_batch, static_argnums=3)
 

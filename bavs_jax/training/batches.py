@@ -44,6 +44,15 @@ def make_pixel_table(scene: Scene) -> PixelTable:
     )
 
 
+def num_training_pixels(scene: Scene | PixelTable, view_ids) -> np.ndarray:
+    """How many pixels of each of some views are trained on, [n] int: those that are not masked."""
+    offsets, mask = np.asarray(scene.offsets), scene.pixel_mask
+    if mask is None or len(mask) == 1:
+        return np.diff(offsets)[view_ids]
+    before = np.concatenate([[0], np.cumsum(np.asarray(mask), dtype=np.int64)])
+    return np.diff(before[offsets])[view_ids]
+
+
 @struct.dataclass
 class PixelBatch:
     """R training pixels."""

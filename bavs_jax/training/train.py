@@ -49,7 +49,6 @@ def make_optimiser(
     max_grad_norm: float = 0.0,
     second_decay: float = 0.99,
     epsilon: float = 1e-15,
-    levels_on: float = 0.0,
 ):
     """Adam with a warm-up and an exponential decay to `final_share * learning_rate`.
 
@@ -77,42 +76,9 @@ def make_optimiser(
         end_value=final_share * learning_rate,
     )
     adam = optax.adam(schedule, b1=0.9, b2=second_decay, eps=epsilon)
-    if levels_on > 0.0:
-        adam = optax.chain(adam, coarse_levels_first(int(levels_on * num_steps)))
     if max_grad_norm > 0.0:
         adam = optax.chain(optax.clip_by_global_norm(max_grad_norm), adam)
     return adam, schedule
-
-
-def coarse_levels_first(num_steps: int) -> optax.GradientTransformation:
-    """Holds the finer levels of hash grids still at first: level l of L moves from step
-    `num_steps l / L` on (FreeNeRF's idea, by the tables' own learning rates; they begin at 0)."""
-
-    def update(updates, state, params=None):
-        del params
-        names = [path for path, _ in jax.tree_util.tree_leaves_with_path(updates)]
-        num_levels = 1 + max((n for n in map(_level, names) if n is not None), default=0)
-
-        def scaled(path, update):
-            level = _level(path)
-            if level is None:
-                return update
-            # over a tenth of the way, so that a level does not begin with a jump
-            since = state.count - num_steps * level / num_levels
-            return update * jnp.clip(since / (0.1 * num_steps) , 0.0, 1.0) if level else update
-
-        moved = jax.tree_util.tree_map_with_path(scaled, updates)
-        return moved, optax.ScaleByScheduleState(count=state.count + 1)
-
-    return optax.GradientTransformation(
-        lambda params: optax.ScaleByScheduleState(count=jnp.zeros([], jnp.int32)), update
-    )
-
-
-def _level(path) -> int | None:
-    """The level of a hash grid's table by its place in the parameters, None of other arrays."""
-    name = path[-1].key if hasattr(path[-1], "key") else ""
-    return int(name.removeprefix("level_")) if str(name).startswith("level_") else None
 
 
 def init_train_state(key, field: Field, sampler: Sampler, optimiser) -> TrainState:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from bavs_jax.fields.contraction import in_box, unit_coordinates
-from bavs_jax.fields.deformation import DeformationGrid, interpolate
+from bavs_jax.fields.deformation import DeformationGrid, interpolate, offset_unit
 from bavs_jax.rendering.render import Channel
 from bavs_jax.uncertainty.posterior import (
     bayesrays_vertex_variance,
@@ -66,8 +66,8 @@ def make_uncertainty_channel(
       grid: the deformation grid.
       variance: [G] from `vertex_variance`.
       variant: one of `VARIANTS`.
-      scale: `sigma` renders sigma over a floor of 0; `log` renders log10(sigma) over a floor
-        of -3. Finish either with `finish_uncertainty`.
+      scale: `sigma` renders sigma over a floor of 0; `log` renders log10(sigma), sigma in
+        `offset_unit`s, over a floor of -3. Finish either with `finish_uncertainty`.
       extent: `box`, or `space` for everything; they differ in unbounded scenes alone.
 
     Raises:
@@ -81,7 +81,7 @@ def make_uncertainty_channel(
     def value_fn(positions, directions):
         del directions
         sigma = uncertainty_at(grid, variance, positions, variant=variant)
-        value = sigma if scale == "sigma" else jnp.log10(sigma)
+        value = sigma if scale == "sigma" else jnp.log10(sigma / offset_unit(grid.box))
         if extent == "space":
             return value
         unit = unit_coordinates(grid.box, positions, contracted=grid.contracted)
@@ -94,6 +94,8 @@ def finish_uncertainty(rendered: jax.Array, *, scale: str) -> jax.Array:
     """What is shown and scored: sigma as it is, log10 sigma clipped to [-3, 6] and put on [0, 1].
 
     A ray that meets nothing is 0 in both scales, so an empty background never counts.
+
+    Differs from the paper, whose sigma is in scene units: here log10 is of sigma in `offset_unit`s.
     """
     if scale == "sigma":
         return rendered

@@ -140,18 +140,19 @@ def make_cleaned_render_fn(
     return render
 
 
-def spread_thresholds(variance, num: int) -> np.ndarray:
+def spread_thresholds(variance, num: int, unit) -> np.ndarray:
     """Thresholds from the most certain vertex to the least certain one, and `+inf` at the end.
 
     Args:
       variance: [G] from `vertex_variance`, scene unit^2, > 0.
       num: how many below `+inf`, evenly spaced in the [0, 1] form.
+      unit: `offset_unit` of the scene's box.
 
     Returns:
       [num + 1] ascending.
     """
     ends = jnp.array([jnp.min(variance), jnp.max(variance)])
-    low, high = finish_uncertainty(0.5 * jnp.log10(ends), scale="log")
+    low, high = finish_uncertainty(0.5 * jnp.log10(ends) - jnp.log10(unit), scale="log")
     return np.append(np.linspace(low, high, num), np.inf).astype(np.float32)
 
 
@@ -209,6 +210,7 @@ def _knee(thresholds: np.ndarray, kept: np.ndarray) -> int:
     return int(np.argmax(kept - chord))
 
 
-def threshold_sigma(threshold) -> np.ndarray:
-    """The offset's standard deviation that a threshold stands for, `10^(9 u - 3)`, scene units."""
-    return 10.0 ** (9.0 * np.asarray(threshold, np.float64) - 3.0)
+def threshold_sigma(threshold, unit) -> np.ndarray:
+    """The offset's standard deviation that a threshold stands for, `unit 10^(9 u - 3)`, where
+    `unit` is the `offset_unit` of the scene's box; scene units."""
+    return unit * 10.0 ** (9.0 * np.asarray(threshold, np.float64) - 3.0)

@@ -55,7 +55,7 @@ class ModelFns(NamedTuple):
 class LaplaceOptions(NamedTuple):
     """The options of the posterior (see `posterior.py` and `channel.py`)."""
 
-    prior_weight: float
+    prior_weight: float  # lambda, 1 / scene unit^2
     weighting: str = "eq13"
     variant: str = "posterior"
     scale: str = "log"
@@ -67,9 +67,10 @@ class LaplaceOptions(NamedTuple):
 class Toolbox(NamedTuple):
     """What a model may use for one scene.
 
-    `curvature(train_state, table, view_ids [N], within [N], label, *, weighting, by_view=False) ->
-      [G, 3]`, the `jac_sq_sum`; if `by_view`, of each of the first `group_size` views by itself,
-      [group_size, G, 3]. Shows progress where `label` is not None.
+    `curvature(train_state, rays [N], label, *, weighting, targets=None, view_ids=None,
+      ray_weight=None, group_ids=None) -> [G, 3]`, the `jac_sq_sum` (see `make_curvature_fn`); with
+      `group_ids` [N] that of each of `group_size` groups of rays, [group_size, G, 3]. Shows
+      progress where `label` is not None.
     `train(kind, key, situation) -> TrainState` trains a field of any kind, from a start of its own,
       on the views of the situation.
     """

@@ -12,7 +12,10 @@ _FACTORS = {"eq13": 2.0, "eq11": 4.0, "empirical": 4.0}
 
 
 def default_prior_weight(log2_cells: int) -> float:
-    """`lambda = 1e-4 / (2^L)^3`: the weight in `loss + lambda |theta|^2`."""
+    """`lambda = 1e-4 / (2^L)^3`: the weight in `loss + lambda |theta|^2`, theta in `offset_unit`s.
+
+    Differs from the paper, whose theta is in whatever unit a scene comes in.
+    """
     return 1e-4 / (2**log2_cells) ** 3
 
 
@@ -27,7 +30,7 @@ def posterior_precision(
       jac_sq_sum: [G, 3] raw sum over rays, >= 0.
       num_rays: R, the rays of the first round. It stays fixed for a run, and for candidates:
         a mean over a growing set would widen the posterior where only old views look.
-      prior_weight: lambda > 0.
+      prior_weight: lambda > 0, 1 / scene unit^2.
       weighting: how `jac_sq_sum` was weighted.
 
     Returns:

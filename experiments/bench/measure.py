@@ -44,7 +44,7 @@ def benchmark(
       command: how this was called.
     """
     start = time.monotonic()
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     subject = make_subject(config, scene, num_views)
     compile_seconds = stages.training_compile_seconds(subject)
     state = train_field(subject)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 import jax
@@ -10,10 +11,11 @@ import numpy as np
 from bavs_jax.active import init_active_state
 from experiments import runtime
 from experiments.bench.subject import SEED
-from experiments.build import build_problem, run_key
+from experiments.build import build_problem
 from experiments.build_scene import initial_views, load_config_scene
-from experiments.errors import ConfigError
+from experiments.errors import ConfigError, shown
 from experiments.evaluate import evaluate_views, spread_evenly
+from experiments.keys import run_key, stream_key
 from experiments.machine import device_name
 from experiments.progress import track
 
@@ -22,12 +24,15 @@ def parse_targets(texts: list[str]) -> list[str]:
     """PSNRs in dB as they were given, the smallest first.
 
     Raises:
-      ConfigError: one of them is not a number.
+      ConfigError: there is none, or one of them is not a finite number.
     """
     try:
-        return sorted(texts, key=float)
+        numbers = [*map(float, texts)]
     except ValueError:
-        raise ConfigError(f"--targets: {texts} are not all numbers; give some like 25,28") from None
+        numbers = []
+    if not numbers or not all(map(math.isfinite, numbers)):
+        raise ConfigError(f"--targets: {shown(texts)} are not all numbers; give some like 25,28")
+    return sorted(texts, key=float)
 
 
 def measure_run(
@@ -47,7 +52,7 @@ def measure_run(
       `curve`, a list of `{"step", "seconds", "psnr"}`, one for each look; `scene`, `device` and
       `num_test_views`.
     """
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     problem = build_problem(config, scene)
     initial = initial_views(scene, SEED, num_views)
     view_ids = spread_evenly(scene.test, num_test_views)
@@ -72,7 +77,7 @@ def measure_run(
                 paused += time.time() - stopped
             bar.advance(steps, psnr=curve[-1]["psnr"] if curve else np.nan)
 
-        fresh = problem.init_train(jax.random.fold_in(key, 2**31 - 1))
+        fresh = problem.init_train(stream_key(SEED, "init"))
         step(key, init_active_state(fresh, problem.table, initial), None, on_call)
     return {
         "curve": curve,

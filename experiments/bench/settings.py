@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from ml_collections import ConfigDict
 
+from experiments.schema import MAX_LOG2_CELLS, MAX_WIDTH, check_options, leaves, several, whole
+
 
 def default_sizes() -> ConfigDict:
     """Sizes for a few minutes on two cores; tests and big machines take others."""
@@ -31,3 +33,14 @@ def default_sizes() -> ConfigDict:
     sizes.growth.candidate_pixels = 25
     sizes.growth.batch_size = (1, 4, 16, 64)
     return sizes
+
+
+def check_sizes(sizes: ConfigDict) -> None:
+    """Raises ConfigError for a size that cannot be used."""
+    limits = {"candidate_pixels": MAX_WIDTH, "grid_log2": MAX_LOG2_CELLS, "matmul": 1 << 16}
+    limits |= {"copy_mb": 1 << 16, "repeats": 1000, "train_calls": 1000}
+    schema = {}
+    for name, value in leaves(default_sizes()).items():
+        one = whole(1, limits.get(name.rpartition(".")[2], 1 << 24))
+        schema[name] = several(one, 1, 16) if isinstance(value, tuple) else one
+    check_options(sizes, schema, "sizes")

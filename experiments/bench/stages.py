@@ -11,12 +11,14 @@ import numpy as np
 
 from bavs_jax.cameras import Cameras, num_pixels
 from bavs_jax.rendering.images import render_pixels
-from bavs_jax.selection.batch import make_select_batch_fn
+from bavs_jax.selection.batch import acquire
 from bavs_jax.selection.context import Context, make_context
+from bavs_jax.selection.policies import get_policy
 from bavs_jax.training.batches import view_pixel_rays
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.models.laplace import laplace_variance
 from bavs_jax.uncertainty.scoring import mean_uncertainty
+from bavs_jax.uncertainty.streaming import table_rays
 from experiments.bench import work
 from experiments.bench.ceilings import Ceilings
 from experiments.bench.clock import timed, timed_runs
@@ -28,8 +30,9 @@ from experiments.bench.subject import (
     draw_training_pixels,
     pixel_centres,
 )
-from experiments.build import RENDER_CHUNK, run_key
+from experiments.build import RENDER_CHUNK
 from experiments.build_trainer import Trainer
+from experiments.keys import run_key, stream_key
 from experiments.machine import peak_device_memory_mb, peak_memory_mb
 
 
@@ -87,7 +90,7 @@ def _measure(name: str, unit: str, amount: float, run: Callable, repeats: int, w
 
 def training_compile_seconds(subject: Subject) -> float:
     """What the first compiled call takes longer than the second."""
-    state = subject.trainer.init(run_key(SEED))
+    state = subject.trainer.init(stream_key(SEED, "init"))
     run = make_training_run(subject, subject.trainer, state, 1)
     first, second = timed(run)[0], timed(run)[0]
     return first - second
@@ -165,9 +168,9 @@ def measure_rendering(subject: Subject, state: TrainState, sizes) -> Stage:
 def make_curvature_run(subject: Subject, state: TrainState, num_rays: int) -> Callable:
     """Makes `run() -> jac_sq_sum` of so many training pixels."""
     toolbox, table = subject.toolbox, subject.problem.table
-    view_ids, within = draw_training_pixels(subject, num_rays)
+    pixels, weighting = draw_training_pixels(subject, num_rays), toolbox.laplace.weighting
     return lambda: toolbox.curvature(
-        *(state, table, view_ids, within, None), weighting=toolbox.laplace.weighting
+        state, label=None, weighting=weighting, **table_rays(table, *pixels, weighting)
     )
 
 
@@ -218,7 +221,10 @@ def measure_scoring(subject: Subject, state: TrainState, jac_sq_sum, sizes) -> S
 
 
 def make_selection_run(subject: Subject, num_candidates: int, batch_size: int):
-    """Makes `run() -> (selected, survivors, FilterInfo)`, and the context that it selects from."""
+    """Makes `run() -> (selected, SelectionInfo)` of `bavs`, and the context that it selects from.
+
+    The path of runs, with scores that cost nothing.
+    """
     cameras = draw_candidates(subject, num_candidates, 1)
     scores = np.random.default_rng(SEED).uniform(size=num_candidates).astype(np.float32)
     ctx: Context = make_context(
@@ -226,15 +232,16 @@ def make_selection_run(subject: Subject, num_candidates: int, batch_size: int):
         training_positions=subject.problem.table.cameras.positions,
         is_training_view=subject.is_training_view,
         centre=subject.scene.centre,
+        mean_uncertainty_fn=lambda indices, picked: scores[indices],
     )
-    select_batch_fn = make_select_batch_fn(batch_size)
-    return lambda: select_batch_fn(scores, ctx), ctx
+    policy, key = get_policy("bavs"), run_key(SEED)
+    return lambda: acquire(policy, key, ctx, batch_size), ctx
 
 
 def measure_selection(subject: Subject, sizes) -> Stage:
-    """The max-min distance filter (Fig 5) and the largest scores, of scores at hand."""
+    """The max-min distance filter (Fig 5), the largest scores of those at hand, and the report."""
     run, ctx = make_selection_run(subject, sizes.select_candidates, sizes.batch_size)
-    first, (_, _, info) = timed(run)
+    first, (_, info) = timed(run)
     seconds, _ = timed_runs(run, sizes.repeats)
     return Stage(
         *("select", "batches", [1.0] * sizes.repeats, seconds, first - float(np.median(seconds))),

@@ -15,9 +15,10 @@ from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation, Toolbox
 from bavs_jax.uncertainty.scoring import reduced_cameras
 from bavs_jax.uncertainty.streaming import training_pixels
-from experiments.build import Problem, build_problem, run_key
+from experiments.build import Problem, build_problem
 from experiments.build_scene import initial_views
 from experiments.build_trainer import Trainer, build_trainer, train_aside
+from experiments.keys import run_key, stream_key
 from experiments.progress import track
 
 SEED = 0
@@ -94,6 +95,6 @@ def draw_candidates(subject: Subject, num: int, width: int) -> Cameras:
     """Cameras on the hemisphere (Eq 14) with images `width` pixels wide, shaped like the photos."""
     scene = subject.scene
     first = take(scene.cameras, np.full(num, scene.pool[0]))
-    poses = scene_hemisphere(jax.random.key(SEED), scene, num)
+    poses = scene_hemisphere(stream_key(SEED, "places"), scene, num)
     scale = width / float(first.sizes[0, 0])
     return reduced_cameras(first.replace(world_from_cam=poses), scale)

@@ -7,8 +7,9 @@ Counted is what the compiled code does, on pieces of it without loops:
 - rendering and scoring: one chunk of rays with a buffer that its samples just fill, times chunks;
 - curvature: one chunk of rays as wide as the mean ray that meets something, divided by its slots,
   times the samples of all rays; and finding out how many samples each ray has;
-- selection: distances of all candidates to all training views, and one row of distances between
-  candidates for each one that the filter kept at last. Attempts before are left out.
+- selection: distances of all candidates to all training views, once for the filter and twice for
+  the report, and two rows of distances between candidates for each one that the filter kept at
+  last: it is kept, and ranked. Attempts before are left out.
 """
 
 from __future__ import annotations
@@ -23,15 +24,17 @@ from bavs_jax.cameras import Rays
 from bavs_jax.rendering.pixels import basic_images
 from bavs_jax.rendering.render import render_rays
 from bavs_jax.rendering.sampling import first_slots
+from bavs_jax.selection.batch import SelectionInfo
 from bavs_jax.selection.context import Context
-from bavs_jax.selection.distances import FilterInfo, nearest_distances, pairwise_distances
+from bavs_jax.selection.distances import nearest_distances, pairwise_distances
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.channel import make_uncertainty_channel
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 from bavs_jax.uncertainty.model import RECONSTRUCTION
 from experiments.bench.counts import Work, compiled_work
-from experiments.bench.subject import Subject, changed
+from experiments.bench.subject import SEED, Subject, changed
 from experiments.build_trainer import build_trainer
+from experiments.keys import run_key
 
 CHUNK_SAMPLES = 8192  # slots of the piece of curvature
 MIN_WIDTH = 8
@@ -42,7 +45,7 @@ def training_work(subject: Subject, state: TrainState) -> Work:
     config, problem = subject.config, subject.problem
     short = changed(config, train__steps_per_call=1)
     trainer = build_trainer(short, subject.scene, len(problem.table.cameras), RECONSTRUCTION)
-    key = jax.random.key(0)
+    key = run_key(SEED)
     call = compiled_work(trainer.call, key, state, problem.table, subject.is_training_view)
 
     def update(key, state):
@@ -125,10 +128,10 @@ def slot_width(mean_samples: float, num_slots: int) -> int:
     return min(max(power, MIN_WIDTH), num_slots)
 
 
-def selection_work(ctx: Context, info: FilterInfo) -> Work:
+def selection_work(ctx: Context, info: SelectionInfo) -> Work:
     """Of one batch; nearly all of it is distances."""
     to_training = compiled_work(
         nearest_distances, ctx.positions, ctx.training_positions, ctx.is_training_view
     )
     row = compiled_work(pairwise_distances, ctx.positions, ctx.positions[:1])
-    return to_training + row * int(info.num_survivors)
+    return to_training * 3 + row * (2 * int(info.survivors.sum()))

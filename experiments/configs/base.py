@@ -49,7 +49,7 @@ def get_config() -> ConfigDict:
     config.field.log2_table_size = 16
     config.field.width = 64
     config.field.geometry_features = 15
-    config.field.initial_density = 1.0  # 1 / scene unit
+    config.field.initial_optical_depth = 0.3  # of a side of the scene box, before training
     config.field.direction_degree = 2  # spherical-harmonics bands, 1 .. 4
     config.field.appearance_features = 0  # of a code for each view trained on; 0: none
 
@@ -90,7 +90,7 @@ def get_config() -> ConfigDict:
     config.march.num_steps = 192  # steps through the diagonal of the scene box
     config.march.num_slots = 64  # most samples of a ray
     config.march.occupancy_resolution = 64
-    config.march.distortion_weight = 0.0
+    config.march.distortion_weight = 0.0  # of the distortion loss, as in "proposal" below
 
     # --- sampler_kind "proposal" (rendering/proposals.py) ---
     config.proposal = ConfigDict()
@@ -116,7 +116,6 @@ def get_config() -> ConfigDict:
     config.train.learning_rate = 0.0  # 0: what suits the field kind
     config.train.final_share = 0.1  # of the learning rate, at the end of a round
     config.train.warmup_steps = 32  # until the learning rate has its full height
-    config.train.levels_on = 0.0  # share of the steps until all levels of hash grids learn
     config.train.max_grad_norm = 0.0  # longer gradients are cut to this; 0: never
     config.train.adam_b2 = 0.99
     config.train.adam_eps = 1e-15
@@ -126,10 +125,10 @@ def get_config() -> ConfigDict:
     # --- uncertainty (bavs_jax/uncertainty) ---
     config.uncertainty = ConfigDict()
     config.uncertainty.log2_cells = 6  # L: a grid of 2^L cells per side
-    config.uncertainty.prior_weight = 0.0  # lambda; 0: 1e-4 / (2^L)^3
+    config.uncertainty.prior_weight = 0.0  # lambda, of thirds of the box; 0: 1e-4 / (2^L)^3
     config.uncertainty.weighting = "eq13"  # "eq13", "eq11" or "empirical"
     config.uncertainty.variant = "posterior"  # "posterior" or "bayesrays"
-    config.uncertainty.scale = "log"  # "log": log10 sigma on [0, 1]; "sigma"
+    config.uncertainty.scale = "log"  # "log": log10(sigma / third of the box) on [0, 1]; "sigma"
     config.uncertainty.extent = "box"  # what counts: the scene "box", or all "space" around it too
     config.uncertainty.offset_cells = 0.3  # of "laplace_predictive": offsets a priori, in cells
     config.uncertainty.flow_draws = 16  # of "cf_nerf" when rendering; 32 in its paper

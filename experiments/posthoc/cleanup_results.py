@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from bavs_jax.fields.deformation import offset_unit
 from bavs_jax.metrics.covered import Sweep
 from bavs_jax.uncertainty.cleanup import threshold_sigma
 from experiments.trained import TrainedRun
@@ -19,12 +20,12 @@ def summary(run: TrainedRun, sweeps: dict[str, Sweep], row: int, options: dict) 
       options: of the choice and the measures.
     """
     thresholds = sweeps["test"].thresholds
-    laplace = run.toolbox.laplace
+    laplace, unit = run.toolbox.laplace, float(offset_unit(run.problem.scene.box))
     return {
         "options": {**options, "variant": laplace.variant, "extent": laplace.extent},
         "chosen": {
             "threshold": _number(thresholds[row]),
-            "sigma": _number(threshold_sigma(thresholds[row])),  # scene units
+            "sigma": _number(threshold_sigma(thresholds[row], unit)),  # scene units
         },
         "before": {name: _measures(sweep, -1) for name, sweep in sweeps.items()},
         "after": {name: _measures(sweep, row) for name, sweep in sweeps.items()},

@@ -19,7 +19,8 @@ from bavs_jax.uncertainty.draws import (
     make_displaced_render_fn,
     noise_scale,
 )
-from experiments.build import RENDER_CHUNK, run_key
+from experiments.build import RENDER_CHUNK
+from experiments.keys import stream_key
 from experiments.progress import track
 from experiments.trained import TrainedRun, run_curvature, run_precision
 
@@ -89,10 +90,7 @@ def draw_views(
     displaced = make_displaced_render_fn(
         field, sampler, tools.grid, background=tools.background, capacity=tools.capacity
     )
-    precision, key = (
-        run_precision(run, jac_sq_sum),
-        jax.random.fold_in(run_key(run.seed), 2**31 - 3),
-    )
+    precision, key = run_precision(run, jac_sq_sum), stream_key(run.seed, "draws")
     by_draw = []
     with track(total * num_draws, f"{run.label}: {num_draws} draws", "rays") as bar:
         for draw in range(num_draws):

@@ -6,7 +6,6 @@ import pathlib
 from collections.abc import Callable
 from functools import partial
 
-import jax
 import numpy as np
 
 from bavs_jax.export.cloud import ray_end_points
@@ -16,13 +15,15 @@ from bavs_jax.export.grid import sample_grid
 from bavs_jax.export.mesh import extract_mesh, without_small_parts
 from bavs_jax.export.ply import ply_bytes
 from bavs_jax.export.volume import nrrd_bytes
+from bavs_jax.fields.deformation import offset_unit
 from bavs_jax.scenes import Scene
 from bavs_jax.scenes.poses import user_points, user_units
 from bavs_jax.scenes.sdf_surface import sample_surface
 from bavs_jax.uncertainty.channel import finish_uncertainty
 from bavs_jax.uncertainty.streaming import training_pixels
-from experiments.build import RENDER_CHUNK, run_key
+from experiments.build import RENDER_CHUNK
 from experiments.files import write_arrays, write_atomic
+from experiments.keys import stream_key
 from experiments.progress import track
 from experiments.trained import TrainedRun
 
@@ -33,13 +34,13 @@ SHELL_SHARE, SURFACE_TOLERANCE = 5e-3, 5e-5
 VOLUMES = {  # name of the file: what it holds, and its unit in the user's coordinates
     "density": "density, 1 / user unit",
     "sigma": "standard deviation of the offset, user units",
-    "uncertainty": "log10 of sigma in scene units, [-3, 6] put on [0, 1]",
+    "uncertainty": "log10 of sigma in thirds of the box's mean side, [-3, 6] put on [0, 1]",
 }
 
 
-def on_unit_scale(sigma) -> np.ndarray:
+def on_unit_scale(sigma, box) -> np.ndarray:
     """Standard deviations in scene units as renderings show them: their log on [0, 1]."""
-    return np.asarray(finish_uncertainty(np.log10(sigma), scale="log"))
+    return np.asarray(finish_uncertainty(np.log10(sigma / offset_unit(box)), scale="log"))
 
 
 def in_user_units(scene: Scene, values: dict) -> dict:
@@ -48,7 +49,7 @@ def in_user_units(scene: Scene, values: dict) -> dict:
     return {
         "density": values["density"] / unit,
         "sigma": values["sigma"] * unit,
-        "uncertainty": on_unit_scale(values["sigma"]),
+        "uncertainty": on_unit_scale(values["sigma"], scene.box),
     }
 
 
@@ -156,7 +157,7 @@ def measure_geometry(run: TrainedRun, mesh, signed_distance: Callable, *, num: i
     side = float(np.max(scene.box[1] - scene.box[0]))
     print(f"geometry: draws {num} points on each surface")
     true = sample_surface(
-        jax.random.fold_in(run_key(run.seed), 2**31 - 4),
+        stream_key(run.seed, "surface"),
         signed_distance,
         scene.box,
         2 * num,

@@ -12,7 +12,8 @@ from experiments.build import Problem, build_problem
 from experiments.build_scene import load_config_scene
 from experiments.errors import ConfigError, WorkdirError
 from experiments.evaluate import measure_test_views
-from experiments.files import write_json
+from experiments.files import read_json, write_json
+from experiments.parts import is_completed
 from experiments.report import write_report
 from experiments.sweeps.record import read_record
 from experiments.trained import TrainedRun, field_kind, find_runs, load_run, saved_config
@@ -49,7 +50,7 @@ def _measure_folder(folder: pathlib.Path, wanted: Wanted, command: str) -> None:
     if not todo:
         print(f"{folder}: nothing is left to measure")
         return
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     problems: dict[str, Problem] = {}
     for number, (policy, seed) in enumerate(todo):
         kind = field_kind(policy)
@@ -91,9 +92,8 @@ def _runs_without(folder: pathlib.Path, wanted: Wanted) -> list[tuple[str, int]]
     results = {}
     for policy, seed in find_runs(folder):
         path = folder / policy / f"seed_{seed}" / "result.json"
-        if path.exists():
-            result = json.loads(path.read_text(encoding="utf-8"))
-            results |= {(policy, seed): result} if result["completed"] else {}
+        result = read_json(path, otherwise="left out; start its run again, which makes it anew")
+        results |= {(policy, seed): result} if is_completed(result) else {}
     for policy in wanted.policies:
         if policy not in {name for name, _ in results}:
             raise ConfigError(f"--policy: {policy}: {folder} holds no finished run of it")

@@ -6,7 +6,6 @@ checkpoints in --workdir are taken up as they are.
 
 from __future__ import annotations
 
-import pathlib
 import sys
 from collections.abc import Callable, Iterator
 
@@ -15,9 +14,10 @@ from ml_collections import config_flags
 
 from experiments import compilation, runtime, workdir
 from experiments.build import build_problem
-from experiments.build_scene import load_config_scene
-from experiments.errors import USER_ERRORS, ConfigError
+from experiments.build_scene import check_views, load_config_scene
+from experiments.errors import USER_ERRORS, ConfigError, one_line
 from experiments.machine import device_name, versions
+from experiments.schema import MAX_SEED, given_config
 from experiments.trained import (
     FIRST_ROUND,
     TrainedRun,
@@ -46,7 +46,9 @@ flags.DEFINE_string(
 flags.DEFINE_string(
     "policy", "", "Whose field; initial: round 0. By default the config's first policy."
 )
-flags.DEFINE_integer("seed", None, "Of which seed; by default all seeds of that policy.")
+flags.DEFINE_integer(
+    "seed", None, "Of which seed; by default all seeds of that policy.", 0, MAX_SEED
+)
 flags.DEFINE_string("data_dir", "", "Folder of scenes, if it has moved since the run.")
 
 
@@ -63,7 +65,7 @@ def trained_runs() -> Iterator[TrainedRun]:
     Raises:
       ConfigError, WorkdirError, SceneError: flags, folder or scene cannot be used.
     """
-    folder, config = pathlib.Path(FLAGS.workdir), FLAGS.config
+    folder, config = runtime.given_folder("workdir", "the folder of a run"), given_config()
     if config is None:
         saved = saved_config(folder)
         chosen = choose_runs(folder, saved, FLAGS.policy, FLAGS.seed)
@@ -75,12 +77,15 @@ def trained_runs() -> Iterator[TrainedRun]:
         # A config without rounds ends where all policies begin.
         policy = FLAGS.policy or (config.policies[0] if config.num_rounds else FIRST_ROUND)
         field_kind(policy)  # an unknown policy ends here, before anything is written
-        folder.mkdir(parents=True, exist_ok=True)
-        workdir.claim(folder, config)
+        workdir.check_claim(folder, config)
         seeds = config.seeds if FLAGS.seed is None else (FLAGS.seed,)
         chosen, take_up = [(policy, seed) for seed in seeds], _train_run
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
+    if take_up is _train_run:
+        check_views(config, scene)
     problem = build_problem(config, scene, field_kind(chosen[0][0]))
+    if take_up is _train_run:
+        workdir.claim(folder, config)
     for policy, seed in chosen:
         run = take_up(config, problem, folder, policy, seed)
         state = "the end of" if run.completed else "the last checkpoint of"
@@ -126,14 +131,13 @@ def run_on_trained(work: Callable[[], None]) -> None:
     """Starts `work()` as the main of a script; what is wrong with its flags ends in one line."""
 
     def main() -> None:
-        if not FLAGS.workdir:
-            sys.exit("error: --workdir: is missing; name the folder of a run")
+        given_config()
+        runtime.given_folder("workdir", "the folder of a run")
         compilation.start_cache()
         try:
             work()
         except OSError as error:
-            # The config file is only read when it is first used.
-            sys.exit(f"error: {' '.join(str(error).split())}")
+            sys.exit(f"error: {one_line(error)}")
         except USER_ERRORS as error:
             sys.exit(f"error: {error}")
 

@@ -14,17 +14,18 @@ ROWS = {  # title, colour map
 }
 
 
-def slices_figure(axes, grid: dict) -> Figure:
+def slices_figure(axes, grid: dict, box) -> Figure:
     """Opacity of the voxels and uncertainty on the three planes through the middle of the box.
 
     Args:
       axes: [X], [Y], [Z] scene units.
       grid: "density" and "sigma" [X, Y, Z], scene units.
+      box: [2, 3] of the scene.
     """
     spacing = float(np.mean([axis[1] - axis[0] for axis in axes]))
     shown = {
         "opacity": -np.expm1(-grid["density"] * spacing),
-        "uncertainty": on_unit_scale(grid["sigma"]),
+        "uncertainty": on_unit_scale(grid["sigma"], box),
     }
     figure = Figure(figsize=(7.6, 5.2), layout="constrained")
     places = figure.subplots(len(ROWS), 3, squeeze=False)

@@ -17,6 +17,7 @@ from bavs_jax.cameras import take
 from bavs_jax.candidates import Candidates
 from bavs_jax.prediction import make_predict_fn
 from bavs_jax.selection.policies import get_policy
+from bavs_jax.training.batches import num_training_pixels
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
 from experiments import runtime
 from experiments.build import build_problem
@@ -48,7 +49,7 @@ def plan_ahead(folder: pathlib.Path, runs: Sequence[FinishedRun]) -> list[Finish
       WorkdirError: the runs' pictures were taken at free poses.
     """
     config = saved_config(folder)
-    scene = load_config_scene(config, cache_dir=str(runtime.cache_folder() / "scenes"))
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     problem = build_problem(config, scene)
     if problem.has_empty_views:
         raise WorkdirError(
@@ -65,7 +66,7 @@ def plan_ahead(folder: pathlib.Path, runs: Sequence[FinishedRun]) -> list[Finish
         first = Run(config, problem, folder, None, seed)
         state = first.state()
         is_training = np.asarray(state.is_training_view)
-        num_rays = int(np.diff(scene.offsets)[first.initial].sum())
+        num_rays = int(num_training_pixels(scene, first.initial).sum())
         situation = Situation(state.train, state.table, is_training, num_rays)
         candidates = Candidates(take(scene.cameras, pool), pool, ~is_training[pool])
         for run in (run for run in of_kind if run.seed == seed):

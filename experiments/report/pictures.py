@@ -73,7 +73,7 @@ def uncertainty_limits(all_pictures: list[dict[str, np.ndarray]]) -> tuple[float
     From the 2nd percentile of the values above half the top to the top, the 99th percentile of
     all; rounded outwards.
     """
-    values = [p["uncertainty"][:MAX_VIEWS].ravel() for p in all_pictures]
+    values = [image.ravel() for p in all_pictures for image in p["uncertainty"][:MAX_VIEWS]]
     values = np.concatenate(values) if values else np.zeros(0)
     values = values[np.isfinite(values)]
     if values.size == 0:

@@ -8,6 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.errors import ReportError
+from experiments.files import load_arrays
+from experiments.picture_stack import cut_pictures
 from experiments.versioned import read_versioned
 
 SCHEMA_VERSION = 1
@@ -17,10 +20,6 @@ ACQUISITION_KEYS = (
     *("scores", "survivors", "selected", "initial"),
 )
 RUN_KEYS = ("scene", "policy", "seed", "rounds", "completed")
-
-
-class ReportError(ValueError):
-    """A file that cannot be used: one line that names the file, the field and the fix."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,8 +104,9 @@ def _load_run(result: dict, path: Path) -> Run:
 
 
 def load_pictures(run: Run) -> dict[str, np.ndarray] | None:
-    """Test images of a run, or None if it has none (yet)."""
-    return _load_arrays(run.folder / "pictures.npz", PICTURE_KEYS)
+    """Test images of a run, each at its own size, or None if it has none (yet)."""
+    arrays = _load_arrays(run.folder / "pictures.npz", PICTURE_KEYS)
+    return None if arrays is None else cut_pictures(arrays)
 
 
 def load_acquisition(run: Run) -> dict[str, np.ndarray] | None:
@@ -115,10 +115,9 @@ def load_acquisition(run: Run) -> dict[str, np.ndarray] | None:
 
 
 def _load_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray] | None:
-    if not path.exists():
+    try:
+        return load_arrays(path, *keys)
+    except FileNotFoundError:
         return None
-    with np.load(path, allow_pickle=False) as file:
-        missing = [key for key in keys if key not in file]
-        if missing:
-            raise ReportError(f"{path}: lacks {', '.join(missing)}; run the experiment again")
-        return {key: file[key] for key in file.files}
+    except ValueError as error:
+        raise ReportError(f"{error}; run the experiment again, which makes it anew") from error

@@ -23,12 +23,14 @@ from bavs_jax.selection.information import (
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.selection.worth import Worth, worth_along
 from bavs_jax.sources import make_candidate_curvature_fn
+from bavs_jax.training.batches import num_training_pixels
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
 from bavs_jax.uncertainty.posterior import posterior_precision
 from bavs_jax.uncertainty.scoring import mean_uncertainty, reduced_cameras
 from experiments.build import RENDER_CHUNK, Problem
 from experiments.evaluate import spread_evenly
+from experiments.keys import stream_key
 from experiments.progress import track
 
 NUM_AT_ONCE = 8  # candidates between two steps of the progress bar
@@ -70,8 +72,8 @@ def make_score_fn(problem: Problem, train: TrainState, cameras: Cameras, scale: 
 
 
 def photo_rays(problem: Problem) -> int:
-    """R of Eq 13: the rays of all training photos."""
-    return int(np.diff(problem.scene.offsets)[problem.scene.pool].sum())
+    """R of Eq 13: the rays of all training photos that are not masked."""
+    return int(num_training_pixels(problem.scene, problem.scene.pool).sum())
 
 
 def photo_situation(problem: Problem, train: TrainState, cameras: Cameras) -> Situation:
@@ -155,7 +157,7 @@ def suggest(
     gains = information_gains(information, len(cameras), "what candidates would tell")
 
     chooser = get_policy(policy)
-    source_key, choose_key = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
+    source_key, choose_key = jax.random.split(stream_key(seed, "choice"))
     situation = photo_situation(problem, train, cameras)
     fields = {"mean_uncertainty_fn": lambda rows, picked: scores[rows], "information": information}
     if chooser.uncertainty != "laplace" or not chooser.needs <= fields.keys():

@@ -17,9 +17,11 @@ from bavs_jax.placement.seen import in_unknown_space
 from bavs_jax.scenes import Scene
 from bavs_jax.scenes.normalise import transform_poses
 from bavs_jax.scenes.pose_files import read_pose_file
+from experiments.keys import stream_key
 from experiments.suggest.settings import Options
 
 CLEARANCE_SHARE = 0.05  # of the median distance of the photos from what they look at
+OPPOSITE = 1e-3  # length of the mean of two directions below which it has none of its own
 SOLID_SHARE = 0.05  # the same, over which solid matter takes away half of the light
 FIXES = {
     "out of bounds": "widen --bounds",
@@ -137,6 +139,13 @@ def candidate_cameras(scene: Scene, poses) -> Cameras:
     return cameras.replace(world_from_cam=np.asarray(poses, np.float32))
 
 
+def gaze_between(directions) -> np.ndarray:
+    """Unit directions [N, 3] midway between two [N, 2, 3]; of opposite ones, the first."""
+    middle = directions.mean(axis=1)
+    length = np.linalg.norm(middle, axis=-1, keepdims=True)
+    return np.where(length > OPPOSITE, middle / np.maximum(length, OPPOSITE), directions[:, 0])
+
+
 def _make_draw_fn(scene: Scene, around: Surroundings, options: Options) -> Callable:
     """Lap number -> poses [n, 3, 4] in scene coordinates."""
     cameras = np.asarray(scene.cameras.world_from_cam, np.float64)
@@ -149,11 +158,11 @@ def _make_draw_fn(scene: Scene, around: Surroundings, options: Options) -> Calla
         targets = np.broadcast_to(around.focus, positions.shape)
         if not around.faces_focus:
             # Photos that look outwards have nothing in common to look at.
-            targets = positions - around.distance * cameras[pairs, :, 2].mean(axis=1)
+            targets = positions + around.distance * gaze_between(-cameras[pairs, :, 2])
         return aim(positions, turned_targets(rng, positions, targets, options.gaze_jitter), up)
 
     def hemisphere(rng, lap):
-        key = jax.random.fold_in(jax.random.key(options.seed), lap)
+        key = jax.random.fold_in(stream_key(options.seed, "places"), lap)
         return hemisphere_poses(key, num, centre=around.focus, radius=around.distance, up=up)
 
     def box(rng, lap):

@@ -9,8 +9,11 @@ import numpy as np
 
 from bavs_jax.placement.collect import PlacementError
 from experiments.configs import capture
+from experiments.errors import shown
 
 KINDS = ("shell", "hemisphere", "box", "file")
+MAX_POSES = 100_000
+MAX_LENGTH = 1e9  # user units
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,8 +42,8 @@ def check_options(options: Options) -> None:
         ("num_views", o.num_views >= 1, "give 1 or more"),
         ("num_candidates", o.num_candidates >= o.num_views, "give at least --num_views"),
         ("candidates", o.candidates in KINDS, f"use one of {', '.join(KINDS)}"),
-        ("clearance", o.clearance >= 0.0, "give 0 or more"),
-        ("spread", o.spread > 0.0, "give a number above 0"),
+        ("clearance", 0.0 <= o.clearance <= MAX_LENGTH, "give 0 or more, up to 1e9"),
+        ("spread", 0.0 < o.spread <= 1000.0, "give a number above 0, up to 1000"),
         ("gaze_jitter", 0.0 <= o.gaze_jitter <= 90.0, "give degrees from 0 to 90"),
         ("score_scale", 0.0 < o.score_scale <= 1.0, "give a share above 0 and up to 1"),
     ):
@@ -62,8 +65,10 @@ def parse_numbers(text: str, count: int, flag: str) -> np.ndarray | None:
         values = np.array([float(part) for part in text.split(",")])
     except ValueError as error:
         raise PlacementError(f"--{flag}: {error}: give {count} numbers with commas") from error
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise PlacementError(f"--{flag}: {text!r}: give {count} finite numbers with commas")
+    if values.shape != (count,) or not (abs(values) <= MAX_LENGTH).all():
+        raise PlacementError(
+            f"--{flag}: {shown(text)}: give {count} numbers of at most 1e9 with commas"
+        )
     return values
 
 

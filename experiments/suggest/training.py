@@ -6,7 +6,6 @@ import dataclasses
 import pathlib
 import time
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,10 +15,12 @@ from bavs_jax.training.checkpoints import Checkpoints
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import Situation
 from bavs_jax.uncertainty.models.laplace import training_curvature
-from experiments.build import Problem, run_key
+from experiments.build import Problem
 from experiments.evaluate import evaluate_views, spread_evenly
-from experiments.files import write_arrays
+from experiments.files import read_arrays, write_arrays
+from experiments.keys import run_key, stream_key
 from experiments.progress import track
+from experiments.runtime import warn
 
 
 def all_for_training(scene: Scene, holdout: int) -> Scene:
@@ -42,11 +43,12 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
       FloatingPointError: the loss is not finite.
     """
     pool, steps = problem.scene.pool, config.train.steps_per_call
-    checkpoints = Checkpoints(folder / "checkpoints", keep=1)
-    init_key = jax.random.fold_in(run_key(seed), 2**31 - 1)
+    checkpoints = Checkpoints(folder / "checkpoints", warn_fn=warn)
+    init_key = stream_key(seed, "init")
     state = init_active_state(problem.init_train(init_key), problem.table, pool)
-    if checkpoints.latest() is not None:
-        saved, meta = checkpoints.restore(state.train)
+    found = checkpoints.restore(state.train)
+    if found is not None:
+        saved, meta = found
         state = state.replace(train=saved, calls=jnp.int32(meta["calls"]))
     left = problem.calls_per_round - int(state.calls)
     if left > 0:
@@ -72,15 +74,14 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
 def photo_curvature(problem: Problem, train: TrainState, folder: pathlib.Path, seed: int):
     """`jac_sq_sum` [G, 3] of all training photos, kept in `folder` once it is made."""
     path = folder / "curvature.npz"
-    if path.exists():
-        with np.load(path) as data:
-            return jnp.asarray(data["jac_sq_sum"])
+    if (kept := read_arrays(path, "jac_sq_sum")) is not None:
+        return jnp.asarray(kept["jac_sq_sum"])
     is_training = np.zeros(len(problem.table.cameras), bool)
     is_training[problem.scene.pool] = True
     toolbox = problem.make_toolbox(track)
     situation = Situation(train, problem.table, is_training, num_rays=0, label="photos")
     jac_sq_sum = training_curvature(
-        run_key(seed), toolbox, situation, weighting=toolbox.laplace.weighting
+        stream_key(seed, "photos"), toolbox, situation, weighting=toolbox.laplace.weighting
     )
     write_arrays(path, jac_sq_sum=np.asarray(jac_sq_sum))
     return jac_sq_sum

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import ast
 import itertools
+import math
 import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from experiments.errors import ConfigError
+from experiments.errors import ConfigError, shown
 
 OWN_AXES = {"policies": "policy", "seeds": "seed"}  # options that are axes of their own
+MAX_TRIALS = 10_000  # policies x seeds x settings of a sweep
+MAX_TEXT = 100_000  # characters of an axis
 
 
 class Axes(NamedTuple):
@@ -34,7 +37,8 @@ def parse_axes(texts: list[str], config, changes: Sequence[str] = ()) -> Axes:
         combination with the others.
 
     Raises:
-      ConfigError: an axis that is unknown, given twice or empty, or a value of another type.
+      ConfigError: an axis that is unknown, given twice or empty, a value of another type, or more
+        than `MAX_TRIALS` in all.
     """
     found: dict[str, tuple] = {}
     options = []
@@ -43,6 +47,8 @@ def parse_axes(texts: list[str], config, changes: Sequence[str] = ()) -> Axes:
     for flag, text in [("axis", t) for t in texts] + [("change", t) for t in changes]:
         name, equals, values = text.partition("=")
         try:
+            if len(text) > MAX_TEXT:
+                raise ConfigError(f"has {len(text):,} characters; give at most {MAX_TEXT:,}")
             if not equals or not values:
                 raise ConfigError("give name=value,value, such as seed=0:5")
             names = name.split("+")
@@ -59,13 +65,22 @@ def parse_axes(texts: list[str], config, changes: Sequence[str] = ()) -> Axes:
             else:
                 raise ConfigError(f"{name} is an axis: --axis={text}")
         except ConfigError as error:
-            raise ConfigError(f"--{flag}={text}: {error}") from None
-    return Axes(
+            raise ConfigError(
+                f"--{flag}={text if len(text) <= 200 else shown(text)}: {error}"
+            ) from None
+    axes = Axes(
         policies=found.get("policy", tuple(config.policies)),
         seeds=found.get("seed", tuple(config.seeds)),
         options=tuple(options),
         changes=tuple(itertools.chain(*alone)),
     )
+    counts = [len(axes.policies), len(axes.seeds), 1 + len(axes.changes), *map(len, axes.options)]
+    if math.prod(counts) > MAX_TRIALS:
+        raise ConfigError(
+            f"--axis: {' x '.join(map(str, counts))} are {math.prod(counts):,} trials; "
+            f"give axes of at most {MAX_TRIALS:,} in all"
+        )
+    return axes
 
 
 def settings(axes: Axes) -> list[dict[str, Any]]:
@@ -115,16 +130,36 @@ def _option_values(names: list[str], text: str, examples: list) -> tuple[dict[st
 def _values(text: str, example) -> tuple:
     values = []
     for item in _items(text):
-        is_range = type(example) is int and re.fullmatch(r"-?\d+(:-?\d+){1,2}", item)
-        values += range(*map(int, item.split(":"))) if is_range else [_value(item, example)]
+        is_range = type(example) is int and re.fullmatch(r"-?\d{1,18}(:-?\d{1,18}){1,2}", item)
+        values += _range(item) if is_range else [_value(item, example)]
+        if len(values) > MAX_TRIALS:
+            raise ConfigError(f"has more than {MAX_TRIALS:,} values; give fewer")
     if not values or len(set(values)) < len(values):
         raise ConfigError("has no value, or one of them twice")
     return tuple(values)
 
 
+def _range(item: str) -> range:
+    """`first:end` or `first:end:step`, not yet as values: there may be far too many."""
+    numbers = [*map(int, item.split(":"))]
+    if numbers[2:] == [0]:
+        raise ConfigError(f"{item!r} has a step of 0")
+    values = range(*numbers)
+    if len(values) > MAX_TRIALS:
+        raise ConfigError(f"{item!r} has more than {MAX_TRIALS:,} values; give fewer")
+    return values
+
+
 def _items(text: str) -> list[str]:
     """What stands between commas that are not in brackets."""
-    return re.split(r",(?![^(\[]*[)\]])", text)
+    items, depth = [""], 0
+    for letter in text:
+        depth += (letter in "([") - (letter in ")]")
+        if letter == "," and depth <= 0:
+            items.append("")
+        else:
+            items[-1] += letter
+    return items
 
 
 def _value(text: str, example):
@@ -132,10 +167,13 @@ def _value(text: str, example):
         return text
     try:
         value = ast.literal_eval(text)
-    except (ValueError, SyntaxError):
-        value = None
+        hash(value)
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
+        value = None  # the last two: too many brackets
     if isinstance(example, float) and type(value) is int:
         value = float(value)
     if type(value) is not type(example):
-        raise ConfigError(f"{text!r} is not of type {type(example).__name__}, as {example!r} is")
+        raise ConfigError(
+            f"{shown(text)} is not of type {type(example).__name__}, as {example!r} is"
+        )
     return value

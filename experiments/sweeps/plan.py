@@ -41,17 +41,17 @@ def make_settings(config, axes: Axes, workdir: pathlib.Path) -> list[Setting]:
       SelectionError: a policy that does not exist.
       ConfigError: two settings whose folders would have the same name.
     """
-    made = []
+    made: dict[str, Setting] = {}
     for values in settings(axes):
         own = copy.deepcopy(config)
         own.policies, own.seeds = axes.policies, axes.seeds
         own.update_from_flattened_dict(values)
         name = setting_name(values) if values or not axes.changes else UNCHANGED
         parts = all_parts(axes.policies, axes.seeds)
-        if name in [setting.name for setting in made]:
+        if name in made:
             raise ConfigError(f"--axis: two settings would share the folder {name}; drop one")
-        made.append(Setting(values, name, workdir / name, own, parts))
-    return made
+        made[name] = Setting(values, name, workdir / name, own, parts)
+    return [*made.values()]
 
 
 def make_trials(

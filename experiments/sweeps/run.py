@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import pathlib
 
 from experiments import workdir
@@ -32,8 +33,11 @@ def run_trials(
     before = shown = _steps_done(trials, counters, set())
     total = sum(map(num_steps, trials)) - before
     running, finished, failed = set(), set(), set()
-    with track(total, f"{len(trials)} processes", "steps") as bar:
-        for kind, job, reason in run_jobs([t.job for t in trials], engine, retries=retries):
+    with (
+        contextlib.closing(run_jobs([t.job for t in trials], engine, retries=retries)) as events,
+        track(total, f"{len(trials)} processes", "steps") as bar,
+    ):
+        for kind, job, reason in events:
             if kind == "started":
                 running.add(job.name)
             elif kind != "tick":

@@ -11,6 +11,10 @@ import signal
 from collections.abc import Callable, Iterator
 from typing import NamedTuple, Protocol
 
+from experiments.signals import CODES
+
+STOPPED = {code: number for number, code in CODES.items()}  # exit codes of what was asked to end
+
 
 class Job(NamedTuple):
     """One process of the project's Python, to be run at most once to its end."""
@@ -87,7 +91,7 @@ def run_jobs(
                     yield Event("started", job)
             for job, code in engine.wait(wait_seconds) if running else ():
                 running.remove(job.name)
-                died = code is None or code < 0
+                died = code is None or code < 0 or code in STOPPED
                 if code == 0 and job.is_finished():
                     yield Event("finished", job)
                 elif died and attempts[job.name] <= retries:
@@ -108,8 +112,9 @@ def death_words(code: int | None) -> str:
     """How a process that did not end by itself came to its end."""
     if code is None:
         return "its machine or its worker is gone"
-    name = signal.Signals(-code).name
-    hint = "; out of memory?" if -code == signal.SIGKILL else ""
+    number = STOPPED.get(code, -code)
+    name = signal.Signals(number).name
+    hint = "; out of memory?" if number == signal.SIGKILL else ""
     return f"killed by {name}{hint}"
 
 

@@ -25,7 +25,10 @@ class StepCounter:
         end = text.rfind(b"\n") + 1
         self._offset += end
         for line in text[:end].splitlines():
-            event = json.loads(line)
+            try:
+                event = json.loads(line)
+            except ValueError:  # what was being written when a process was killed
+                continue
             rounds = event["round"] + (event["event"] == "round")
             steps = rounds * self._steps_per_round + event.get("step", 0)
             part = f"{event['policy']}/seed_{event['seed']}"

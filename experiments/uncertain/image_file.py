@@ -6,7 +6,7 @@ import pathlib
 
 import numpy as np
 
-from experiments.files import write_arrays
+from experiments.files import read_arrays, write_arrays
 
 
 def save_images(path: pathlib.Path, images: list[dict[str, np.ndarray]], seconds: float) -> None:
@@ -15,10 +15,11 @@ def save_images(path: pathlib.Path, images: list[dict[str, np.ndarray]], seconds
     write_arrays(path, **arrays, seconds=np.float64(seconds))
 
 
-def load_images(path: pathlib.Path) -> tuple[list[dict[str, np.ndarray]], float]:
-    """The inverse of `save_images`."""
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {key: file[key] for key in file.files}
+def load_images(path: pathlib.Path) -> tuple[list[dict[str, np.ndarray]], float] | None:
+    """The inverse of `save_images`; None where there is no file or a damaged one."""
+    arrays = read_arrays(path, "seconds")
+    if arrays is None:
+        return None
     seconds = float(arrays.pop("seconds"))
     images = [{} for _ in {key.split("/")[0] for key in arrays}]
     for key, values in arrays.items():

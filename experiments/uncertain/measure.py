@@ -16,6 +16,7 @@ from bavs_jax.rendering.images import render_views
 from bavs_jax.uncertainty.bands import uncertainty_of
 from bavs_jax.uncertainty.model import Situation
 from experiments.build import RENDER_CHUNK, Problem
+from experiments.picture_stack import stack_pictures
 from experiments.progress import track
 
 IMAGES = ("rgb", "depth", "opacity", "uncertainty", "depth_uncertainty")
@@ -135,12 +136,13 @@ def curve_arrays(found: dict[str, Sparsification], prefix: str) -> dict[str, np.
 def picture_arrays(scene, view_ids, images: list[dict], shown) -> dict[str, np.ndarray]:
     """Truth, render, colour error and uncertainty of the views at places `shown`."""
     views = [int(view_ids[i]) for i in shown]
-    truth = np.stack([scene.image(v) for v in views])
-    rgb = np.stack([np.clip(images[i]["rgb"], 0.0, 1.0) for i in shown])
+    truth = stack_pictures([scene.image(v) for v in views])
+    rgb = stack_pictures([np.clip(images[i]["rgb"], 0.0, 1.0) for i in shown])
     return {
         "names": np.array([scene.names[v] for v in views]),
+        "sizes": np.asarray(scene.cameras.sizes)[views],
         "truth": truth,
         "rgb": np.round(255.0 * rgb).astype(np.uint8),
         "error": np.abs(rgb - truth / 255.0).mean(-1).astype(np.float32),
-        "uncertainty": np.stack([images[i]["uncertainty"] for i in shown]),
+        "uncertainty": stack_pictures([images[i]["uncertainty"] for i in shown]),
     }

@@ -6,17 +6,16 @@ field, and of each model the numbers, curves and intervals. The numbers come las
 
 from __future__ import annotations
 
-import json
 import pathlib
 from functools import partial
 
-import jax
 import numpy as np
 
 from bavs_jax.rendering.images import render_views
-from experiments.build import RENDER_CHUNK, Problem, run_key
+from experiments.build import RENDER_CHUNK, Problem
 from experiments.evaluate import mean_quality, spread_evenly
-from experiments.files import write_arrays, write_json
+from experiments.files import read_arrays, read_json, write_arrays, write_json
+from experiments.keys import stream_key
 from experiments.machine import code_commit
 from experiments.trained import FIRST_ROUND, train_run
 from experiments.uncertain import intervals, measure
@@ -46,7 +45,7 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
     scene, options = problem.scene, config.evaluation
     situation = trained_situation(config, problem, folder, seed, command)
     view_ids = spread_evenly(scene.test, options.num_views)
-    key = jax.random.fold_in(run_key(seed), 2**31 - 3)
+    key = stream_key(seed, "evaluation")
     common = _common_images(problem, folder, seed, key, situation, view_ids)
     errors_of = partial(measure.pixel_errors, scene, view_ids, scale_depth=options.scale_depth)
     about_common = errors_of(common.images), mean_quality(scene, view_ids, common.images)
@@ -79,17 +78,17 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
 
 
 def is_done(path: pathlib.Path) -> bool:
-    """Whether a row is there, made by this version."""
-    if not path.exists():
-        return False
-    return json.loads(path.read_text(encoding="utf-8")).get("row_version") == ROW_VERSION
+    """Whether a row is there with its arrays, made by this version."""
+    row = read_json(path)
+    is_current = row is not None and row.get("row_version") == ROW_VERSION
+    return is_current and read_arrays(path.with_suffix(".npz")) is not None
 
 
 def _common_images(problem, folder, seed, key, situation, view_ids) -> measure.ModelImages:
     """Renders of the run's own field with the entropy of its rays, from file if they are there."""
     path = folder / "uncertainty" / "common" / f"seed_{seed}.npz"
-    if path.exists():
-        return measure.ModelImages(*load_images(path))
+    if (kept := load_images(path)) is not None:
+        return measure.ModelImages(*kept)
     fitted = measure.fit_model(problem, COMMON_MODEL, key, situation)
     label = f"{situation.label}: {COMMON_MODEL}"
     rendered = measure.render_model(problem.scene, fitted, view_ids, label)

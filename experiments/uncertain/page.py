@@ -7,6 +7,7 @@ import pathlib
 import numpy as np
 from markupsafe import Markup
 
+from experiments.picture_stack import cut_pictures
 from experiments.report.pictures import ERROR_MAP, UNCERTAINTY_MAP, colourise, png_uri, shrink
 from experiments.uncertain.band_picture import LEVEL, band_strip, scanline_plot
 from experiments.uncertain.coverage_plots import coverage_plot, decile_plot, width_plot
@@ -39,7 +40,7 @@ def write_page(path: pathlib.Path, result: dict, *, arrays: dict, variant: str) 
     variants = known_variants(rows)
     variant = variant if variant in variants else variants[0]
     titles = {field: f"Error of what is left, {words}" for field, words in FIELDS.items()}
-    pictures = {model: found[0] for model, found in arrays.items()}
+    pictures = {model: cut_pictures(found[0]) for model, found in arrays.items()}
     shown = models_of(rows)[0]
     write_template(
         path,
@@ -70,7 +71,7 @@ def _strips(pictures: dict[str, dict[str, np.ndarray]]) -> list[dict]:
     for model, arrays in pictures.items():
         if "names" not in arrays:  # no pictures were asked for
             continue
-        top = np.percentile(arrays["uncertainty"], 99.0)
+        top = np.percentile(np.concatenate([u.ravel() for u in arrays["uncertainty"]]), 99.0)
         for i, name in enumerate(arrays["names"]):
             shown = (
                 ("truth", arrays["truth"][i]),

@@ -15,7 +15,7 @@ from bavs_jax.uncertainty.model import (
     UncertaintyModel,
 )
 from bavs_jax.uncertainty.scoring import make_render_chunk_fn
-from bavs_jax.uncertainty.streaming import training_pixels
+from bavs_jax.uncertainty.streaming import table_rays, training_pixels
 
 
 def training_curvature(key, toolbox: Toolbox, situation: Situation, weighting: str) -> jax.Array:
@@ -27,9 +27,11 @@ def training_curvature(key, toolbox: Toolbox, situation: Situation, weighting: s
         rows = np.sort(np.random.default_rng(seed).permutation(len(view_ids))[:most])
         scale = len(view_ids) / most
         view_ids, within = view_ids[rows], within[rows]
-    label = f"{situation.label}: curvature"
     return scale * toolbox.curvature(
-        situation.train, situation.table, view_ids, within, label, weighting=weighting
+        situation.train,
+        label=f"{situation.label}: curvature",
+        weighting=weighting,
+        **table_rays(situation.table, view_ids, within, weighting),
     )
 
 

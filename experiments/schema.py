@@ -1,0 +1,303 @@
+"""What every option of experiments/configs/base.py may be, checked before any work is done."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import NamedTuple
+
+from absl import flags
+from ml_collections import ConfigDict
+
+from bavs_jax.metrics.ause import ERRORS, variant_name
+from bavs_jax.metrics.perceptual import NETS
+from bavs_jax.scenes import LOADERS
+from bavs_jax.scenes.lightfield import SPLITS
+from bavs_jax.selection.policies import POLICIES
+from bavs_jax.selection.policy import MODES
+from bavs_jax.uncertainty.channel import EXTENTS, SCALES, VARIANTS
+from bavs_jax.uncertainty.conformal_scale import SCALES as INTERVAL_SCALES
+from bavs_jax.uncertainty.curvature import WEIGHTINGS
+from bavs_jax.uncertainty.models import MODELS
+from experiments.build_field import SAMPLERS
+from experiments.errors import ConfigError, one_line, shown
+
+MAX_SEED = 2**32 - 1  # a larger one is the key of another seed, or none
+MAX_WIDTH = 8192  # pixels of an image
+MAX_COUNT = 10**9
+MAX_VALUE = 1e9  # of a number without a natural bound; above it float32 loses what is added
+MAX_LOG2_CELLS = 9
+GRID_MEMORY = "a grid of 2^9 cells per side takes 1.6 GB for each view's curvature, 2^10 13 GB"
+
+
+class Option(NamedTuple):
+    """What one option may be."""
+
+    wanted: str  # in words, to follow "give"
+    fits: Callable  # value -> bool
+
+
+def whole(low: int, high: int, zero: str = "", *, note: str = "") -> Option:
+    """A whole number, and 0 where it has a meaning of its own; the `note` says what limits it."""
+    words = f"a whole number from {low:,} to {high:,}" + (f", or 0: {zero}" if zero else "")
+    words += f" ({note})" if note else ""
+
+    def fits(value):
+        return type(value) is int and (low <= value <= high or (value == 0 and bool(zero)))
+
+    return Option(words, fits)
+
+
+def number(low: float, high: float, zero: str = "", *, open_low=False, open_high=False) -> Option:
+    """A finite number; `open_*` leaves its end out."""
+    least = f"above {low:g}" if open_low else f"from {low:g}"
+    most = f"below {high:g}" if open_high else f"to {high:g}"
+    words = f"a number {least} {most}" + (f", or 0: {zero}" if zero else "")
+
+    def fits(value):
+        if type(value) not in (int, float):
+            return False
+        if value == 0.0 and zero:
+            return True
+        above = value > low if open_low else value >= low
+        return above and (value < high if open_high else value <= high)
+
+    return Option(words, fits)
+
+
+def choice(*known: str) -> Option:
+    """One of some words."""
+    words = f"one of {', '.join(repr(name) for name in known)}"
+    return Option(words, lambda value: type(value) is str and value in known)
+
+
+def several(item: Option, least: int, most: int, *, distinct: bool = True) -> Option:
+    """A tuple of things."""
+    once = ", each once" if distinct else ""
+    words = f"a tuple of {least:,} to {most:,}{once}: {item.wanted}"
+
+    def fits(values):
+        if type(values) is not tuple or not least <= len(values) <= most:
+            return False
+        return all(map(item.fits, values)) and (not distinct or len({*values}) == len(values))
+
+    return Option(words, fits)
+
+
+FLAG = Option("True or False", lambda value: type(value) is bool)
+TEXT = Option(
+    "up to 1,000 characters that can be printed",
+    lambda value: type(value) is str and len(value) <= 1000 and value.isprintable(),
+)
+SEED = whole(0, MAX_SEED)
+WEIGHT = number(0.0, 1e6)
+LAYERS, WIDTH, SAMPLES, RESOLUTION = whole(1, 64), whole(1, 4096), whole(1, 4096), whole(1, 65536)
+TABLE = whole(1, 24)  # 16 million rows
+
+
+def _views(zero: str = "") -> Option:
+    return whole(1, 100_000, zero)
+
+
+SCHEMA = {
+    "loader": choice(*LOADERS, "auto"),
+    "data_dir": TEXT,
+    "scene": TEXT,
+    "image_size": whole(1, MAX_WIDTH, "as the files are"),
+    "load.strict": FLAG,
+    "load.downscale": whole(1, 1024, "as the loader sees fit"),
+    "load.pool_size": Option(
+        "a share above 0 and below 1, a whole count up to 100000, or 0: as the loader sees fit",
+        lambda value: (
+            type(value) in (int, float)
+            and 0 <= value <= 100_000
+            and (value < 1 or value == int(value))
+        ),
+    ),
+    "load.test_every": whole(2, 100_000, "as the loader sees fit"),
+    "load.seed": SEED,
+    "load.split": choice("", *SPLITS),
+    "policies": several(choice(*POLICIES), 1, len(POLICIES)),
+    "seeds": several(SEED, 1, 10_000),
+    "num_initial": _views("all of the pool"),
+    "batch_size": _views(),
+    "num_rounds": whole(0, 10_000),
+    "from_scratch": FLAG,
+    "num_test": _views("all"),
+    "num_test_final": _views("all"),
+    "num_pictures": _views("all"),
+    "predict_gain": FLAG,
+    "lpips_net": choice("", *NETS),
+    "checkpoint_seconds": number(0.0, MAX_VALUE),
+    "field_kind": choice(*SAMPLERS),
+    "sampler_kind": choice("", *sorted({*itertools.chain(*SAMPLERS.values())})),
+    "field.num_levels": whole(1, 32),
+    "field.coarsest": RESOLUTION,
+    "field.finest": RESOLUTION,
+    "field.features": whole(1, 64),
+    "field.log2_table_size": TABLE,
+    "field.width": WIDTH,
+    "field.geometry_features": WIDTH,
+    "field.initial_optical_depth": real(1e-6, 1e3),
+    "field.direction_degree": whole(1, 4),
+    "field.appearance_features": whole(1, 1024, "none"),
+    "nerf_mlp.depth": LAYERS,
+    "nerf_mlp.width": WIDTH,
+    "nerf_mlp.skip": whole(0, 64),
+    "nerf_mlp.position_degree": whole(1, 24),
+    "nerf_mlp.direction_degree": whole(1, 24),
+    "mip_mlp.depth": LAYERS,
+    "mip_mlp.width": WIDTH,
+    "mip_mlp.skip": whole(0, 64),
+    "mip_mlp.position_degree": whole(1, 24),
+    "mip_mlp.direction_degree": whole(1, 24),
+    "mip_mlp.proposal_depth": LAYERS,
+    "mip_mlp.proposal_width": WIDTH,
+    "flow.condition_features": WIDTH,
+    "flow.num_flows": LAYERS,
+    "flow_training.num_draws": whole(2, 1024),
+    "flow_training.entropy_weight": WEIGHT,
+    "flow_training.floor": number(0.0, 1e3, open_low=True),
+    "coarse_to_fine.num_coarse": SAMPLES,
+    "coarse_to_fine.num_fine": SAMPLES,
+    "march.num_steps": whole(1, 65536),
+    "march.num_slots": SAMPLES,
+    "march.occupancy_resolution": whole(1, 512),
+    "march.distortion_weight": WEIGHT,
+    "proposal.num_proposals": several(SAMPLES, 1, 8, distinct=False),
+    "proposal.num_samples": SAMPLES,
+    "proposal.far": number(0.0, MAX_VALUE, open_low=True),
+    "proposal.num_levels": whole(1, 32),
+    "proposal.coarsest": RESOLUTION,
+    "proposal.finest": several(RESOLUTION, 1, 8, distinct=False),
+    "proposal.log2_table_size": TABLE,
+    "proposal.width": WIDTH,
+    "proposal.anneal_steps": whole(0, MAX_COUNT),
+    "proposal.interlevel_weight": WEIGHT,
+    "proposal.distortion_weight": WEIGHT,
+    "proposal.penalty_weight": WEIGHT,
+    "train.num_steps": whole(1, 10_000_000),
+    "train.num_rays": whole(1, 1 << 20),
+    "train.capacity": whole(1, 1 << 24),
+    "train.learning_rate": number(0.0, 1.0, "what suits the field kind", open_low=True),
+    "train.final_share": number(0.0, 1.0, open_low=True),
+    "train.warmup_steps": whole(0, 10_000_000),
+    "train.max_grad_norm": number(0.0, MAX_VALUE, "never cut", open_low=True),
+    "train.adam_b2": number(0.0, 1.0, open_high=True),
+    "train.adam_eps": number(0.0, 1.0, open_low=True),
+    "train.penalty_weight": WEIGHT,
+    "train.random_background": FLAG,
+    "train.steps_per_call": whole(1, 100_000),
+    "uncertainty.log2_cells": whole(1, MAX_LOG2_CELLS, note=GRID_MEMORY),
+    "uncertainty.prior_weight": number(0.0, 1e6, "1e-4 / (2^L)^3", open_low=True),
+    "uncertainty.weighting": choice(*WEIGHTINGS),
+    "uncertainty.variant": choice(*VARIANTS),
+    "uncertainty.scale": choice(*SCALES),
+    "uncertainty.extent": choice(*EXTENTS),
+    "uncertainty.offset_cells": number(0.0, 1e3, open_low=True),
+    "uncertainty.flow_draws": whole(2, 1024),
+    "uncertainty.ensemble_size": whole(2, 64),
+    "uncertainty.max_rays": whole(1, MAX_COUNT, "all"),
+    "evaluation.models": several(choice(*MODELS), 1, len(MODELS)),
+    "evaluation.num_views": _views("all"),
+    "evaluation.scale_depth": FLAG,
+    "evaluation.variant": choice(
+        *(
+            variant_name(of=of, error=error, pooled=pooled)
+            for of, error, pooled in itertools.product(("colour", "depth"), ERRORS, (False, True))
+        )
+    ),
+    "evaluation.num_interval_views": _views("all"),
+    "evaluation.num_interval_pixels": whole(1, MAX_COUNT, "all"),
+    "evaluation.interval_scale": choice(*INTERVAL_SCALES),
+    "candidates.source": choice("dataset", "hemisphere"),
+    "candidates.hemisphere_draws": _views(),
+    "candidates.image_scale": number(0.0, 1.0, open_low=True),
+    "candidates.mode": choice("", *MODES),
+    "candidates.min_train_distance": number(0.0, MAX_VALUE),
+    "candidates.min_candidate_distance": number(0.0, MAX_VALUE),
+}
+
+
+def given_config(example: str = "") -> ConfigDict | None:
+    """The config that the flags give, checked; None if they give none and no `example` is due.
+
+    Raises:
+      ConfigError: it is missing, cannot be read, or holds an option that cannot be used.
+    """
+    config = flags.FLAGS.config
+    if config is None:
+        if example:
+            raise ConfigError(f"--config: is missing; try --config={example}")
+        return None
+    try:
+        return check_config(config)
+    except OSError as error:  # the config file is only read when it is first used
+        raise ConfigError(f"--config: {one_line(error)}") from None
+
+
+def check_config(config: ConfigDict, *more: str, name: str = "config") -> ConfigDict:
+    """The config itself, once every option is of its type, within its range and fits the others.
+
+    Args:
+      config: from `experiments.configs`, with what flags have changed.
+      more: counts of views that a script adds to the options of base.py, 0 allowed.
+      name: what errors call it.
+
+    Raises:
+      ConfigError: the first option that cannot be used.
+    """
+    values = check_options(config, SCHEMA | {option: _views("none") for option in more}, name)
+    _check_together(values, name)
+    return config
+
+
+def check_options(config: ConfigDict, schema: dict[str, Option], name: str) -> dict:
+    """The options of a config by their dotted names, each checked by itself.
+
+    Raises:
+      ConfigError: one that cannot be used, is missing or is not in the schema.
+    """
+    if not isinstance(getattr(config, "items", None), Callable):
+        raise ConfigError(f"--{name}: get_config() returns {shown(config)}; return a ConfigDict")
+    values = leaves(config)
+    for option in values:
+        if option not in schema:
+            raise ConfigError(f"{name}.{option}: is no option; known are {', '.join(schema)}")
+    for option, wanted in schema.items():
+        if option not in values:
+            raise ConfigError(f"{name}.{option}: is missing; give {wanted.wanted}")
+        check_option(f"{name}.{option}", wanted, values[option])
+    return values
+
+
+def check_option(name: str, option: Option, value) -> None:
+    """Raises ConfigError for a value that an option cannot have."""
+    if not option.fits(value):
+        raise ConfigError(f"{name}: is {shown(value)}; give {option.wanted}")
+
+
+def _check_together(values: dict, name: str) -> None:
+    for group in ("field", "proposal"):
+        coarsest, finest = values[f"{group}.coarsest"], values[f"{group}.finest"]
+        if min(finest if isinstance(finest, tuple) else (finest,)) < coarsest:
+            raise ConfigError(
+                f"{name}.{group}.finest: is {finest}; give at least {group}.coarsest, {coarsest}"
+            )
+    given = [values[f"candidates.min_{what}_distance"] for what in ("train", "candidate")]
+    if 0.0 in given and any(given):
+        raise ConfigError(
+            f"{name}.candidates: give both min_train_distance and min_candidate_distance, "
+            "or neither"
+        )
+
+
+def leaves(config, prefix: str = "") -> dict:
+    """Every option by its dotted name; a group that is no group counts as an option."""
+    found = {}
+    for key, value in config.items():
+        if isinstance(value, ConfigDict):
+            found |= leaves(value, f"{prefix}{key}.")
+        else:
+            found[f"{prefix}{key}"] = value
+    return found

@@ -1,0 +1,142 @@
+"""Colour and depth of the curvature and the predictive variance are those of the renderer."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.fields.hash_grid import make_hash_grid_density, make_hash_grid_field
+from bavs_jax.rendering.pixels import basic_images, render_pixels
+from bavs_jax.rendering.proposals import make_proposal_sampler
+from bavs_jax.rendering.render import render_rays
+from bavs_jax.rendering.samplers import make_occupancy_sampler
+from bavs_jax.rendering.sampling import make_march_options
+from bavs_jax.rendering.spacing import open_intervals
+from bavs_jax.uncertainty.curvature import colour_jacobian, field_slopes, split_colour_jacobian
+from bavs_jax.uncertainty.predictive import depth_jacobian, make_predictive_fn
+from bavs_jax.uncertainty.streaming import make_curvature_fn
+from tests.toy_fields import rays_through
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+BOX = np.array([[-1.0, -1.2, -0.8], [1.0, 1.1, 0.9]], np.float32)
+NUM_RAYS, NUM_VIEWS, CAPACITY = 30, 5, 4096
+
+
+def setting(unbounded, codes):
+    """A field with random parameters, its sampler, parameters, state and background."""
+    field = make_hash_grid_field(
+        BOX,
+        num_levels=2,
+        coarsest=4,
+        finest=8,
+        width=8,
+        contracted=unbounded,
+        num_views=NUM_VIEWS,
+        appearance_features=codes,
+    )
+    if unbounded:
+        density = make_hash_grid_density(
+            BOX, num_levels=2, coarsest=4, finest=8, width=8, contracted=True
+        )
+        interval_fn = partial(open_intervals, near=0.1, far=100.0, unit=1.0)
+        sampler = make_proposal_sampler([density], interval_fn, num_proposals=(8,), num_samples=12)
+    else:
+        options = make_march_options(BOX, near=0.1, far=10.0, num_steps=32, num_slots=12)
+        sampler = make_occupancy_sampler(BOX, options, resolution=4)
+    params = {"field": field.init(jax.random.key(0)), "sampler": sampler.init(jax.random.key(1))}
+    leaves, structure = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(2), len(leaves))
+    leaves = [x + 0.5 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys)]
+    params = jax.tree.unflatten(structure, leaves)
+    background = None if unbounded else np.float32([1.0, 0.6, 0.2])
+    return field, sampler, params, sampler.init_state(), background
+
+
+every_setting = pytest.mark.parametrize("codes", [0, 3])
+every_space = pytest.mark.parametrize("unbounded", [False, True])
+# Matrix products of other shapes, in float32.
+close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
+
+
+@every_space
+@every_setting
+def test_the_jacobians_differentiate_what_is_rendered(unbounded, codes):
+    field, sampler, params, state, background = setting(unbounded, codes)
+    rays = rays_through(jax.random.key(3), NUM_RAYS)
+    view_ids = jnp.arange(NUM_RAYS) % NUM_VIEWS
+    field_fn = partial(field.apply, params["field"])
+
+    @jax.jit
+    def everything():
+        samples, _ = sampler.sample(None, params["sampler"], state, rays)
+        inputs = field.inputs(rays, samples, view_ids)
+        options = {"background": background, "inputs": inputs}
+        rendering = render_rays(rays, samples, field_fn, capacity=CAPACITY, exact=True, **options)
+        colours = [
+            jacobian_fn(field_fn, rays, samples, **options)[1]
+            for jacobian_fn in (colour_jacobian, split_colour_jacobian)
+        ]
+        slopes = field_slopes(field_fn, rays, samples, inputs=inputs)
+        return rendering.rgb, rendering.depth, colours, depth_jacobian(slopes, samples)[1]
+
+    rgb, depth, colours, its_depth = everything()
+    assert np.std(rgb) > 0.01 and np.std(depth) > 0.01
+    for colour in colours:
+        close(colour, rgb)
+    close(its_depth, depth)
+
+
+@every_space
+@every_setting
+def test_the_predictive_images_are_those_of_the_renderer(unbounded, codes):
+    field, sampler, params, state, background = setting(unbounded, codes)
+    grid = DeformationGrid(jnp.asarray(BOX), 2, contracted=unbounded)
+    some = rays_through(jax.random.key(3), NUM_RAYS)
+    away = some.replace(directions=-some.directions)  # in a bounded scene they meet nothing
+    rays = jax.tree.map(lambda *x: jnp.concatenate(x), some, away)
+    predictive = make_predictive_fn(field, sampler, grid, background=background, chunk_samples=128)
+    images = predictive(params, state, jnp.full((grid.num_vertices, 3), 1e-4), rays)
+    want = jax.jit(
+        lambda: basic_images(
+            *render_pixels(
+                *(field, sampler, params, state, rays), background=background, capacity=CAPACITY
+            )
+        )
+    )()
+    assert want.keys() <= images.keys()
+    for name, value in want.items():
+        close(images[name], value, err_msg=name)
+
+
+@every_space
+@every_setting
+def test_the_residual_of_the_curvature_is_that_of_the_render(unbounded, codes):
+    """Weighted by its residual, a ray whose true colour is the rendered one has no curvature."""
+    field, sampler, params, state, background = setting(unbounded, codes)
+    grid = DeformationGrid(jnp.asarray(BOX), 2, contracted=unbounded)
+    rays = rays_through(jax.random.key(3), NUM_RAYS)
+    view_ids = jnp.arange(NUM_RAYS) % NUM_VIEWS
+
+    @jax.jit
+    def rendered():
+        samples, _ = sampler.sample(None, params["sampler"], state, rays)
+        return render_rays(
+            *(rays, samples, partial(field.apply, params["field"])),
+            background=background,
+            capacity=CAPACITY,
+            exact=True,
+            inputs=field.inputs(rays, samples, view_ids),
+        ).rgb
+
+    curvature = make_curvature_fn(field, sampler, grid, background=background, weighting="eq11")
+    rgb = np.asarray(rendered())
+    right, wrong = (
+        curvature(params, state, rays, targets=targets, view_ids=view_ids)
+        for targets in (rgb, rgb + 0.01)
+    )
+    # Squares of residuals of 1e-5 at most, against those of 0.01.
+    assert float(wrong.max()) > 0.0 and float(right.max()) < 1e-5 * float(wrong.max())
