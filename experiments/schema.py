@@ -138,7 +138,7 @@ SCHEMA = {
     "field.log2_table_size": TABLE,
     "field.width": WIDTH,
     "field.geometry_features": WIDTH,
-    "field.initial_optical_depth": real(1e-6, 1e3),
+    "field.initial_optical_depth": number(1e-6, 1e3),
     "field.direction_degree": whole(1, 4),
     "field.appearance_features": whole(1, 1024, "none"),
     "nerf_mlp.depth": LAYERS,
