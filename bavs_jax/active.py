@@ -20,6 +20,7 @@ from bavs_jax.selection.batch import SelectionInfo, acquire
 from bavs_jax.selection.context import make_context
 from bavs_jax.selection.policy import Policy
 from bavs_jax.training.batches import PixelTable
+from bavs_jax.training.health import MAX_RESTARTS, colour_spread, is_stuck
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import Situation
 
@@ -33,6 +34,7 @@ class ActiveState:
     is_training_view: jax.Array  # [V] bool
     round: jax.Array  # [] int32, 0 while only the initial views are there
     calls: jax.Array  # [] int32, compiled training calls done in this round
+    restarts: jax.Array  # [] int32, times that this round began anew since its field was stuck
 
 
 class Choice(NamedTuple):
@@ -58,6 +60,7 @@ class Stages(NamedTuple):
     """The parts of a round as functions, put together by the caller.
 
     `train_call(key, train_state, table, is_training_view) -> (train_state, TrainInfo)`
+    `init(key) -> train_state`, fresh, for a field that is stuck
     `restart(key, train_state) -> train_state` at the start of each round after the first: a fresh
       optimiser, and fresh parameters too where each round trains from scratch.
     `sources(policy, key, situation, candidates) -> Sources` (see `sources.py`)
@@ -65,6 +68,7 @@ class Stages(NamedTuple):
     """
 
     train_call: Callable
+    init: Callable
     restart: Callable
     sources: Callable
     predict: Callable | None = None
@@ -80,6 +84,7 @@ def init_active_state(train: TrainState, table: PixelTable, initial_views) -> Ac
         is_training_view=jnp.asarray(is_training),
         round=jnp.int32(0),
         calls=jnp.int32(0),
+        restarts=jnp.int32(0),
     )
 
 
@@ -91,6 +96,7 @@ def make_active_step(
     centre,
     batch_size: int,
     calls_per_round: int,
+    check_call: int | None = None,
     num_rays: int,
     radii=None,
     mode: str | None = None,
@@ -109,6 +115,8 @@ def make_active_step(
       centre: [3] scene centre, scene units.
       batch_size: views chosen at once.
       calls_per_round: compiled training calls of a round.
+      check_call: after how many of them a field that is stuck begins anew with another key, at
+        most `health.MAX_RESTARTS` times in a round; None: never.
       num_rays: R of Eq 13, the training rays of round 0.
       radii: of the max-min distance filter; by default from the cameras.
       mode: "top_k" or "greedy"; by default the policy's own.
@@ -151,6 +159,7 @@ def make_active_step(
             is_training_view=state.is_training_view.at[view_ids].set(True),
             round=state.round + 1,
             calls=jnp.int32(0),
+            restarts=jnp.int32(0),
         )
         return state, Choice(view_ids, selected, candidates, selection, seconds, predicted)
 
@@ -165,9 +174,9 @@ def make_active_step(
 
         _, _, train_key = _round_keys(key, int(state.round))
         start = time.perf_counter()
-        for call in range(int(state.calls), calls_per_round):
+        while (call := int(state.calls)) < calls_per_round:
             train, train_info = stages.train_call(
-                jax.random.fold_in(train_key, call),
+                _call_key(train_key, int(state.restarts), call),
                 state.train,
                 state.table,
                 state.is_training_view,
@@ -178,12 +187,27 @@ def make_active_step(
                     f"{float(train_info.loss)}; try a smaller learning rate"
                 )
             state = state.replace(train=train, calls=jnp.int32(call + 1))
+            if call + 1 == check_call and int(state.restarts) < MAX_RESTARTS:
+                spread = colour_spread(state.table, state.is_training_view)
+                if is_stuck(train_info, spread):
+                    restarts = int(state.restarts) + 1
+                    state = state.replace(
+                        train=stages.init(_call_key(train_key, restarts, calls_per_round)),
+                        calls=jnp.int32(0),
+                        restarts=jnp.int32(restarts),
+                    )
             if on_call is not None:
                 on_call(state, train_info)
         jax.block_until_ready(state.train.step)
         return state, RoundInfo(int(state.round), choice, time.perf_counter() - start)
 
     return step
+
+
+def _call_key(train_key, restarts: int, call: int):
+    """Of one compiled call; a round that begins anew draws other pixels."""
+    key = train_key if restarts == 0 else jax.random.fold_in(train_key, 2**31 - 1 - restarts)
+    return jax.random.fold_in(key, call)
 
 
 def _round_keys(key, number: int):

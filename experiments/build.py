@@ -22,6 +22,7 @@ from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.sources import SourceOptions, make_sources_fn
 from bavs_jax.training.batches import PixelTable, make_pixel_table, num_training_pixels
+from bavs_jax.training.health import check_call, colour_spread, is_stuck
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, LaplaceOptions, Toolbox
 from bavs_jax.uncertainty.models import MODELS
@@ -54,6 +55,7 @@ class Problem(NamedTuple):
     lpips_fn: Callable | None
     lpips_reason: str | None
     calls_per_round: int
+    is_stuck: Callable  # (TrainInfo, ActiveState) -> bool: the last of a round has learnt nothing
     has_empty_views: bool  # whether the table has room for pictures taken on the way
     first_empty_row: int  # of the pixel table
     num_devices: int  # that share the rays
@@ -180,6 +182,11 @@ def build_problem(
             true_error_fn=true_error_fn,
         )
 
+    def is_stuck_at_end(info, state) -> bool:
+        if check_call(calls_per_round(config), config.train.steps_per_call) is None:
+            return False  # too short a round to have learnt anything
+        return is_stuck(info, colour_spread(state.table, state.is_training_view))
+
     def make_step(policy_name: str, initial, track: Callable, label: str):
         predict = None
         if config.predict_gain:
@@ -188,11 +195,12 @@ def build_problem(
             )
         return active.make_active_step(
             get_policy(policy_name),
-            active.Stages(trainer.call, restart, sources_fn(track), predict),
+            active.Stages(trainer.call, trainer.init, restart, sources_fn(track), predict),
             source,
             centre=scene.centre,
             batch_size=config.batch_size,
             calls_per_round=calls_per_round(config),
+            check_call=check_call(calls_per_round(config), config.train.steps_per_call),
             num_rays=int(num_training_pixels(scene, np.asarray(initial)).sum()),
             radii=_radii(config),
             mode=config.candidates.mode or None,
@@ -216,6 +224,7 @@ def build_problem(
         lpips_fn=lpips_fn,
         lpips_reason=lpips_reason,
         calls_per_round=calls_per_round(config),
+        is_stuck=is_stuck_at_end,
         has_empty_views=_has_empty_views(scene, table),
         first_empty_row=int(scene.offsets[-1]),
         num_devices=num_shards(mesh),

@@ -15,6 +15,7 @@ from bavs_jax.fields.base import Field
 from bavs_jax.fields.flow_field import FlowField, mean_field
 from bavs_jax.rendering.samplers import Sampler
 from bavs_jax.scenes import Scene
+from bavs_jax.training.health import MAX_RESTARTS, check_call, colour_spread, is_stuck
 from bavs_jax.training.objectives import (
     make_colour_objective,
     make_flow_objective,
@@ -114,21 +115,28 @@ def train_aside(
     Raises:
       FloatingPointError: the loss is not finite.
     """
-    init_key, steps_key = jax.random.split(key)
-    state = trainer.init(init_key)
     num_calls, steps = calls_per_round(config), config.train.steps_per_call
+    check = check_call(num_calls, steps)
     with track(num_calls * steps, f"{situation.label}: train {kind}", "steps") as bar:
-        for number in range(num_calls):
-            state, info = trainer.call(
-                jax.random.fold_in(steps_key, number),
-                state,
-                situation.table,
-                situation.is_training_view,
-            )
-            if not np.isfinite(info.loss):
-                raise FloatingPointError(
-                    f"{kind} field, training call {number}: the loss is {float(info.loss)}; "
-                    "try a smaller learning rate"
+        for attempt in range(MAX_RESTARTS + 1):
+            init_key, steps_key = jax.random.split(jax.random.fold_in(key, attempt))
+            state = trainer.init(init_key)
+            for number in range(num_calls):
+                state, info = trainer.call(
+                    jax.random.fold_in(steps_key, number),
+                    state,
+                    situation.table,
+                    situation.is_training_view,
                 )
-            bar.advance(steps, loss=float(info.loss))
-    return state
+                if not np.isfinite(info.loss):
+                    raise FloatingPointError(
+                        f"{kind} field, training call {number}: the loss is {float(info.loss)}; "
+                        "try a smaller learning rate"
+                    )
+                bar.advance(steps, loss=float(info.loss))
+                if number + 1 == check and attempt < MAX_RESTARTS:
+                    spread = colour_spread(situation.table, situation.is_training_view)
+                    if is_stuck(info, spread):
+                        break
+            else:
+                return state

@@ -14,6 +14,7 @@ import numpy as np
 from bavs_jax.active import ActiveState, Choice, init_active_state
 from bavs_jax.training.batches import num_training_pixels
 from bavs_jax.training.checkpoints import Checkpoints
+from bavs_jax.training.health import MAX_RESTARTS
 from bavs_jax.uncertainty.model import Situation
 from experiments import acquisitions
 from experiments.baselines import measure_baselines
@@ -120,6 +121,10 @@ class Run:
                 nonlocal clock, saved
                 jax.block_until_ready(info)
                 self.pending["seconds"]["train"] += time.monotonic() - clock
+                if int(state.restarts) > self.pending["restarts"]:
+                    self._record_restart(state, info)
+                if int(state.calls) == calls_per_round:
+                    self.pending["stuck"] = self.problem.is_stuck(info, state)
                 numbers = {"loss": float(info.loss), "psnr": float(-10 * jnp.log10(info.loss))}
                 bar.advance(steps, **numbers)
                 calls = int(state.calls)
@@ -137,6 +142,16 @@ class Run:
                 open_bar(state)
             state, _ = step(run_key(self.seed), state, on_choice, on_call)
         return state
+
+    def _record_restart(self, state: ActiveState, info) -> None:
+        self.pending["restarts"] = int(state.restarts)
+        at = {"round": int(state.round), "restarts": int(state.restarts)}
+        self._log(event="restart", **at, loss=float(info.loss), thinned=float(info.thinned))
+        warn(
+            f"{self.label}: round {int(state.round)}: the field is stuck (loss "
+            f"{float(info.loss):.3g}, {float(info.thinned):.0%} of the rays full of fog): "
+            "trained anew with another key"
+        )
 
     def _record_choice(self, number: int, choice: Choice) -> None:
         in_scene = not self.problem.has_empty_views
@@ -204,9 +219,10 @@ class Run:
         return fresh
 
     def _save(self, state: ActiveState) -> None:
-        """Writes a checkpoint; its number grows with rounds, calls and measures."""
+        """Writes a checkpoint; its number grows with rounds, restarts, calls and measures."""
         calls = int(state.calls) + (len(self.rounds) > int(state.round))
-        number = int(state.round) * (self.problem.calls_per_round + 2) + calls
+        attempt = int(state.round) * (MAX_RESTARTS + 1) + int(state.restarts)
+        number = attempt * (self.problem.calls_per_round + 2) + calls
         meta = {"rounds": self.rounds, "pending": self.pending}
         self.checkpoints.save(number, saved_part(self.problem, state), meta)
 
@@ -273,7 +289,8 @@ class Run:
 
 def _new_pending() -> dict:
     names = ("train", "curvature", "fit", "score", "select", "predict", "evaluate")
-    return {"selected": [], "seconds": dict.fromkeys(names, 0.0)}
+    seconds = dict.fromkeys(names, 0.0)
+    return {"selected": [], "seconds": seconds, "restarts": 0, "stuck": False}
 
 
 def saved_part(problem: Problem, state: ActiveState):
@@ -284,6 +301,7 @@ def saved_part(problem: Problem, state: ActiveState):
         "is_training_view": state.is_training_view,
         "round": state.round,
         "calls": state.calls,
+        "restarts": state.restarts,
         "world_from_cam": state.table.cameras.world_from_cam,
         **({"new_pixels": state.table.pixels[first:]} if problem.has_empty_views else {}),
         **({"new_alpha": state.table.alpha[first:]} if problem.has_empty_views else {}),
@@ -304,4 +322,5 @@ def whole_state(problem: Problem, saved) -> ActiveState:
         is_training_view=saved["is_training_view"],
         round=saved["round"],
         calls=saved["calls"],
+        restarts=saved["restarts"],
     )

@@ -23,7 +23,7 @@ from bavs_jax.rendering.proposals import make_proposal_sampler
 from bavs_jax.rendering.samplers import make_occupancy_sampler
 from bavs_jax.rendering.sampling import make_march_options
 from bavs_jax.rendering.spacing import box_intervals
-from bavs_jax.training.batches import make_pixel_table
+from bavs_jax.training.batches import make_pixel_table, training_pixels
 from bavs_jax.training.objectives import (
     make_colour_objective,
     make_flow_objective,
@@ -33,7 +33,7 @@ from bavs_jax.training.train import init_train_state, make_train_fn
 from bavs_jax.uncertainty.channel import vertex_variance
 from bavs_jax.uncertainty.predictive import make_predictive_fn
 from bavs_jax.uncertainty.scoring import make_render_chunk_fn, mean_uncertainty
-from bavs_jax.uncertainty.streaming import make_curvature_fn, table_rays, training_pixels
+from bavs_jax.uncertainty.streaming import make_curvature_fn, table_rays
 from tests.toy_scenes import toy_scene
 
 NUM_RAYS, CAPACITY, CHUNK = 64, 4096, 128

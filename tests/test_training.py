@@ -16,6 +16,7 @@ from bavs_jax.training.batches import (
     make_pixel_table,
     pixel_colours,
     sample_pixels,
+    training_pixels,
     view_pixel_rays,
 )
 from bavs_jax.training.checkpoints import Checkpoints
@@ -23,7 +24,7 @@ from bavs_jax.training.losses import colour_loss
 from bavs_jax.training.objectives import make_colour_objective
 from bavs_jax.training.train import init_train_state, make_optimiser, make_train_fn
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
-from bavs_jax.uncertainty.streaming import make_curvature_fn, table_rays, training_pixels
+from bavs_jax.uncertainty.streaming import make_curvature_fn, table_rays
 from tests.toy_scenes import toy_scene
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

@@ -12,10 +12,9 @@ from bavs_jax import active
 from bavs_jax.cameras import take
 from bavs_jax.prediction import summed_curvature
 from bavs_jax.sources import WEIGHTING, make_candidate_curvature_fn, training_looks
-from bavs_jax.training.batches import num_training_pixels
+from bavs_jax.training.batches import num_training_pixels, training_pixels
 from bavs_jax.uncertainty.model import Situation
 from bavs_jax.uncertainty.models.laplace import training_curvature
-from bavs_jax.uncertainty.streaming import training_pixels
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
 from experiments.progress import track

@@ -27,7 +27,7 @@ def ray_end_points(
     Args:
       render_fn: `Rays` [chunk] -> dict with "rgb" [chunk, 3], "depth" and "opacity" [chunk].
       table: the scene's pixels.
-      view_ids, within: [N] views and numbers of the pixels (`streaming.training_pixels`).
+      view_ids, within: [N] views and numbers of the pixels (`batches.training_pixels`).
       chunk: rays of one call.
       min_opacity: of the rays that count, in [0, 1]; below it a ray mostly passes.
       progress_fn: called with the number of rays done.

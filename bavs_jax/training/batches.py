@@ -121,3 +121,16 @@ def view_pixel_rays(cameras: Cameras, view_ids: jax.Array, within: jax.Array) ->
     width = cameras.sizes[view_ids, 0]
     pixels = jnp.stack([within % width, within // width], axis=-1) + 0.5
     return pixel_rays(cameras, view_ids, pixels)
+
+
+def training_pixels(table: PixelTable, is_training_view) -> tuple[np.ndarray, np.ndarray]:
+    """All pixels of the training views that are not masked: view ids [N] and row numbers [N]."""
+    offsets, mask = np.asarray(table.offsets), np.asarray(table.pixel_mask)
+    views = np.flatnonzero(is_training_view)
+    view_ids = np.repeat(views, np.diff(offsets)[views]).astype(np.int32)
+    within = np.concatenate([np.arange(offsets[v + 1] - offsets[v]) for v in views])
+    within = within.astype(np.int32)
+    if len(mask) > 1:
+        keep = mask[offsets[view_ids] + within]
+        view_ids, within = view_ids[keep], within[keep]
+    return view_ids, within

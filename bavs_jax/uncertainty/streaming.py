@@ -25,19 +25,6 @@ RAY_CHUNK = 8192  # rays of one compiled call that makes them, or counts their s
 MAX_GROUP, MAX_GROUP_BYTES = 8, 2**26
 
 
-def training_pixels(table: PixelTable, is_training_view) -> tuple[np.ndarray, np.ndarray]:
-    """All pixels of the training views that are not masked: view ids [N] and row numbers [N]."""
-    offsets, mask = np.asarray(table.offsets), np.asarray(table.pixel_mask)
-    views = np.flatnonzero(is_training_view)
-    view_ids = np.repeat(views, np.diff(offsets)[views]).astype(np.int32)
-    within = np.concatenate([np.arange(offsets[v + 1] - offsets[v]) for v in views])
-    within = within.astype(np.int32)
-    if len(mask) > 1:
-        keep = mask[offsets[view_ids] + within]
-        view_ids, within = view_ids[keep], within[keep]
-    return view_ids, within
-
-
 def table_rays(table: PixelTable, view_ids, within, weighting: str) -> dict:
     """Pixels [N] of views that are trained on, as keywords of `make_curvature_fn`'s `curvature`.
 

@@ -11,10 +11,10 @@ import numpy as np
 from bavs_jax.cameras import Cameras, take
 from bavs_jax.candidates import scene_hemisphere
 from bavs_jax.scenes import Scene
+from bavs_jax.training.batches import training_pixels
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation, Toolbox
 from bavs_jax.uncertainty.scoring import reduced_cameras
-from bavs_jax.uncertainty.streaming import training_pixels
 from experiments.build import Problem, build_problem
 from experiments.build_scene import initial_views
 from experiments.build_trainer import Trainer, build_trainer, train_aside

@@ -19,8 +19,8 @@ from bavs_jax.fields.deformation import offset_unit
 from bavs_jax.scenes import Scene
 from bavs_jax.scenes.poses import user_points, user_units
 from bavs_jax.scenes.sdf_surface import sample_surface
+from bavs_jax.training.batches import training_pixels
 from bavs_jax.uncertainty.channel import finish_uncertainty
-from bavs_jax.uncertainty.streaming import training_pixels
 from experiments.build import RENDER_CHUNK
 from experiments.files import write_arrays, write_atomic
 from experiments.keys import stream_key

@@ -63,6 +63,18 @@ def interval_cell(interval: stats.Interval | None, digits: int, why: str, *, gap
     return Cell(text, interval=interval, p_value=p_value)
 
 
+def seeds_cell(policy: str, runs: list[Run]) -> Cell:
+    """How many seeds there are, and a note where the field of one learnt nothing."""
+    stuck = [run.seed for run in runs if any(r.get("stuck") for r in run.rounds)]
+    if not stuck:
+        return Cell(str(len(runs)))
+    seeds = ", ".join(str(seed) for seed in stuck)
+    why = (
+        f"{policy}: a field of seed {seeds} is stuck in fog, so these numbers are not its policy's"
+    )
+    return Cell(f"{len(runs)}*", why)
+
+
 def p_words(p_value: float) -> str:
     """A p-value, as exactly as it matters."""
     return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.2g}"
@@ -79,7 +91,7 @@ def final_table(runs: list[Run], policies: list[str]) -> Table:
     rows = []
     for policy in policies:
         mine = stats.completed(runs, policy)
-        row = [Cell(policy), Cell(str(len(mine)))]
+        row = [Cell(policy), seeds_cell(policy, mine)]
         if not mine:
             why = f"{policy}: no completed run"
             rows.append((*row, *[dash(why)] * (len(head) - 2)))

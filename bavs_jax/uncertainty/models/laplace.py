@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bavs_jax.training.batches import training_pixels
 from bavs_jax.uncertainty.channel import vertex_variance
 from bavs_jax.uncertainty.model import (
     LaplaceOptions,
@@ -15,7 +16,7 @@ from bavs_jax.uncertainty.model import (
     UncertaintyModel,
 )
 from bavs_jax.uncertainty.scoring import make_render_chunk_fn
-from bavs_jax.uncertainty.streaming import table_rays, training_pixels
+from bavs_jax.uncertainty.streaming import table_rays
 
 
 def training_curvature(key, toolbox: Toolbox, situation: Situation, weighting: str) -> jax.Array:

@@ -1,0 +1,133 @@
+"""Fields that learn nothing begin anew, a stated number of times, and are never told as results."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bavs_jax import active
+from bavs_jax.candidates import dataset_candidates
+from bavs_jax.selection.policies import get_policy
+from bavs_jax.training.batches import make_pixel_table
+from bavs_jax.training.health import MAX_RESTARTS, check_call, colour_spread, is_stuck
+from bavs_jax.training.train import TrainInfo, TrainState
+from experiments.report.results import Run
+from experiments.report.tables import final_table
+from tests.toy_scenes import toy_scene
+
+CALLS, CHECK = 6, 3
+
+
+def report(loss, thinned=0.0):
+    values = {"loss": loss, "thinned": thinned, "rays": 64.0, "samples": 64.0}
+    return TrainInfo(**{k: jnp.float32(v) for k, v in values.items()}, learning_rate=jnp.float32(1))
+
+
+def test_one_colour_for_all_pixels_is_what_a_field_must_beat():
+    scene = toy_scene(num_views=4, num_test=1)
+    table = make_pixel_table(scene)
+    used = np.array([True, False, True, False])
+    colours = np.concatenate([scene.pixels[scene.view_slice(v)] for v in (0, 2)]) / 255.0
+    expected = np.square(colours - colours.mean(0)).mean()
+    np.testing.assert_allclose(colour_spread(table, used), expected, rtol=1e-6)
+    mask = np.zeros(len(scene.pixels), bool)
+    mask[:5] = True
+    masked = table.replace(pixel_mask=jnp.asarray(mask))
+    expected = (scene.pixels[:5] / 255.0).var(axis=0).mean()
+    np.testing.assert_allclose(colour_spread(masked, used), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("loss", "thinned", "stuck"),
+    [(0.02, 0.0, False), (0.05, 0.0, True), (0.001, 0.95, True), (0.001, 0.5, False)],
+)
+def test_what_counts_as_stuck(loss, thinned, stuck):
+    assert is_stuck(report(loss, thinned), 0.04) is stuck
+
+
+def test_short_rounds_are_not_looked_at():
+    assert check_call(200, 16) == 20  # a tenth of 3200 steps
+    assert check_call(100, 16) == 16  # 256 steps
+    assert check_call(31, 16) is None
+
+
+def make_step(losses, scene):
+    """A step whose training calls only report; `losses[a]` is what attempt a reports."""
+    inits, keys = [], []
+
+    def init(key):
+        inits.append(jax.random.key_data(key).tolist())
+        return fresh(len(inits))
+
+    def train_call(key, train, table, is_training_view):
+        keys.append(jax.random.key_data(key).tolist())
+        return train.replace(step=train.step + 1), report(losses[int(train.params)])
+
+    stages = active.Stages(train_call, init, lambda key, train: train, None)
+    step = active.make_active_step(
+        get_policy("random"),
+        stages,
+        dataset_candidates(scene),
+        centre=scene.centre,
+        batch_size=1,
+        calls_per_round=CALLS,
+        check_call=CHECK,
+        num_rays=64,
+    )
+    return step, inits, keys
+
+
+def fresh(attempt):
+    return TrainState(jnp.int32(0), jnp.int32(attempt), (), ())
+
+
+def run(losses):
+    scene = toy_scene(num_views=4, num_test=1)
+    step, inits, keys = make_step(losses, scene)
+    state = active.init_active_state(fresh(0), make_pixel_table(scene), [0, 1])
+    seen = []
+    state, _ = step(jax.random.key(0), state, on_call=lambda s, _: seen.append(s))
+    return state, inits, keys, seen
+
+
+def test_a_stuck_field_begins_anew_with_another_key():
+    state, inits, keys, seen = run([1.0, 0.001])
+    assert (int(state.calls), int(state.restarts), int(state.train.params)) == (CALLS, 1, 1)
+    assert int(state.train.step) == CALLS and len(keys) == CHECK + CALLS
+    assert len(inits) == 1 and len({tuple(k) for k in keys}) == len(keys)
+    assert [int(s.restarts) for s in seen] == [0] * (CHECK - 1) + [1] * (CALLS + 1)
+
+
+def test_a_field_that_learns_is_left_alone():
+    state, inits, keys, _ = run([0.001])
+    assert int(state.restarts) == 0 and not inits and len(keys) == CALLS
+
+
+def test_restarts_are_bounded():
+    state, inits, keys, _ = run([1.0] * 9)
+    assert int(state.restarts) == MAX_RESTARTS == len(inits)
+    assert len(keys) == MAX_RESTARTS * CHECK + CALLS
+    assert len({tuple(k) for k in [*keys, *inits]}) == len(keys) + len(inits)
+
+
+def test_a_round_that_was_restarted_goes_on_from_a_checkpoint_alike():
+    scene = toy_scene(num_views=4, num_test=1)
+    _, _, whole, seen = run([1.0, 0.001])
+    half = seen[CHECK + 1]  # two calls into the second attempt
+    step, inits, rest = make_step([1.0, 0.001], scene)
+    state, _ = step(jax.random.key(0), half)
+    assert not inits and rest == whole[-len(rest) :] and len(rest) == CALLS - 2
+    assert int(state.restarts) == 1
+
+
+def test_a_table_marks_policies_with_a_stuck_field(tmp_path):
+    def result(policy, seed, **more):
+        rounds = [{"num_views": 4, "psnr": 20.0, "stuck": False}]
+        rounds.append({"num_views": 8, "psnr": 25.0, "stuck": False, **more})
+        return Run(policy, seed, True, rounds, {}, tmp_path)
+
+    runs = [result("bavs", 0), result("bavs", 1, stuck=True), result("random", 0)]
+    table = final_table(runs, ["bavs", "random"])
+    assert [row[1].text for row in table.rows] == ["2*", "1"]
+    (note,) = [why for why in table.reasons if "stuck" in why]
+    assert note.startswith("bavs: a field of seed 1 is stuck in fog")
