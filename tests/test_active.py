@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from bavs_jax.active import init_active_state
-from bavs_jax.candidates import captured_candidates, dataset_candidates, with_empty_views
+from bavs_jax.candidates import (
+    captured_candidates,
+    dataset_candidates,
+    scene_hemisphere,
+    with_empty_views,
+)
 from bavs_jax.training.batches import make_pixel_table
 from bavs_jax.training.checkpoints import Checkpoints
 from experiments.build import build_problem
@@ -120,7 +125,11 @@ def test_hemisphere_draws_snap_to_the_nearest_unused_views():
     source = dataset_candidates(scene, hemisphere_draws=3)
     used = jnp.zeros(12, bool).at[jnp.array([0, 1])].set(True)
     offered = source.propose(jax.random.key(0), None, used)
-    assert 1 <= offered.mask.sum() <= 3 and not offered.mask[:2].any()
+    poses = scene_hemisphere(jax.random.key(0), scene, 3)
+    unused = scene.pool[2:]
+    positions = np.asarray(scene.cameras.positions)[unused]
+    apart = np.linalg.norm(poses[:, None, :, 3] - positions, axis=-1)
+    assert set(offered.view_ids[offered.mask]) == set(unused[apart.argmin(1)])
     everything = dataset_candidates(scene).propose(jax.random.key(0), None, used)
     assert everything.mask.sum() == 7
 

@@ -35,6 +35,12 @@ def test_split_is_a_seeded_permutation(tmp_path):
     assert len(load_nerfstudio(root).pool) == 6  # three quarters
 
 
+@pytest.mark.parametrize("share, num_pool", [(0.6, 5), (0.29, 2), (0.07, 1)])
+def test_a_share_is_rounded_to_whole_views(tmp_path, share, num_pool):
+    root = write_nerfstudio(tmp_path)  # of 8 views: 4.8, 2.32, 0.56
+    assert len(load_nerfstudio(root, pool_size=share).pool) == num_pool
+
+
 @pytest.mark.parametrize("pool_size", [8, 9, 0, -1, 1.0, 0.0, 1.5])
 def test_a_split_may_not_be_empty(tmp_path, pool_size):
     with pytest.raises(SceneError, match=f"transforms.json: pool_size {pool_size}"):

@@ -237,6 +237,20 @@ def test_the_penalty_pulls_at_the_field_by_its_weight(trainer):
         np.testing.assert_allclose(tables[3.0][name] - tables[0.0][name], expected, atol=1e-7)
 
 
+@pytest.mark.parametrize("capacity, num_rays", [(1, 0), (2048, 64)])
+def test_rays_that_did_not_fit_do_not_count_in_the_loss(trainer, capacity, num_rays):
+    scene, field, sampler, *_ = trainer
+    objective = make_colour_objective(field, background=scene.background, capacity=capacity)
+    optimiser, schedule = make_optimiser(learning_rate=1e-2, final_share=0.3, num_steps=64)
+    train = make_train_fn(
+        *(field, sampler, objective, optimiser, schedule), num_rays=64, steps_per_call=1
+    )
+    start = init_train_state(jax.random.key(0), field, sampler, optimiser)
+    mask = jnp.ones(scene.num_views, bool)
+    _, info = train(jax.random.key(1), start, make_pixel_table(scene), mask)
+    assert info.rays == num_rays and (info.loss > 0.01) == (num_rays > 0)
+
+
 def test_training_is_deterministic(trainer):
     scene, _, _, train, fresh = trainer
     table, mask = make_pixel_table(scene), jnp.arange(scene.num_views) < 4
