@@ -11,8 +11,6 @@ what is counted. Other programs on the machine make every number worse.
 
 from __future__ import annotations
 
-import sys
-
 import jax
 from absl import flags
 from ml_collections import config_flags
@@ -22,7 +20,6 @@ from experiments.bench.measure import benchmark
 from experiments.bench.results import BENCHMARK, benchmark_tables
 from experiments.bench.settings import check_sizes, default_sizes
 from experiments.configs import base
-from experiments.errors import USER_ERRORS
 from experiments.report.collected import collected_text
 from experiments.schema import given_config
 
@@ -50,18 +47,15 @@ def main() -> None:
     check_sizes(FLAGS.sizes)
     # Times of compilation are those of a first start, whatever an earlier one has left behind.
     jax.config.update("jax_enable_compilation_cache", False)
-    try:
-        result = benchmark(
-            config,
-            FLAGS.sizes,
-            folder,
-            num_views=FLAGS.num_views,
-            growth=FLAGS.growth,
-            profile=FLAGS.profile,
-            command=runtime.command_line(),
-        )
-    except USER_ERRORS as error:
-        sys.exit(f"error: {error}")
+    result = benchmark(
+        config,
+        FLAGS.sizes,
+        folder,
+        num_views=FLAGS.num_views,
+        growth=FLAGS.growth,
+        profile=FLAGS.profile,
+        command=runtime.command_line(),
+    )
     print(collected_text(benchmark_tables(folder / BENCHMARK)))
     print(f"numbers: {folder / BENCHMARK}")
     print(f"page:    {folder / 'benchmark.html'}  ({result['total_s']:.0f} s in all)")

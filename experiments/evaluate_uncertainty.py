@@ -13,7 +13,6 @@ not computed again: one may kill it and start it again. A folder that
 from __future__ import annotations
 
 import pathlib
-import sys
 import time
 
 from absl import flags
@@ -22,7 +21,6 @@ from ml_collections import config_flags
 from experiments import compilation, runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import check_views, load_config_scene
-from experiments.errors import USER_ERRORS
 from experiments.schema import given_config
 from experiments.uncertain.one_seed import measure_seed
 from experiments.uncertain.summary import write_summary
@@ -58,10 +56,7 @@ def main() -> None:
     config = given_config("experiments/configs/uncertainty.py")
     folder = runtime.given_folder("workdir", "a folder for the results")
     compilation.start_cache()
-    try:
-        evaluate(config, folder, runtime.command_line())
-    except USER_ERRORS as error:
-        sys.exit(f"error: {error}")
+    evaluate(config, folder, runtime.command_line())
 
 
 if __name__ == "__main__":

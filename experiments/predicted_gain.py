@@ -19,10 +19,8 @@ import sys
 from absl import flags
 
 from experiments import compilation, runtime
-from experiments.errors import USER_ERRORS
 from experiments.predicted.compare import PAGE_FILE, compare
 from experiments.predicted.results import RESULT_FILE
-from experiments.report import ReportError
 
 FLAGS = flags.FLAGS
 flags.adopt_module_key_flags(compilation)
@@ -38,15 +36,12 @@ def main() -> None:
     folders = [pathlib.Path(folder) for folder in FLAGS.workdir]
     out = runtime.given_folder("out", "a folder for the results") if FLAGS.out else folders[0]
     compilation.start_cache()
-    try:
-        result = compare(
-            *(folders, out),
-            command=runtime.command_line(),
-            policies=FLAGS.policies,
-            planned=FLAGS.planned,
-        )
-    except (ReportError, *USER_ERRORS) as error:
-        sys.exit(f"error: {error}")
+    result = compare(
+        *(folders, out),
+        command=runtime.command_line(),
+        policies=FLAGS.policies,
+        planned=FLAGS.planned,
+    )
     print(f"{len(result['cases'])} batches")
     print(f"numbers: {out / RESULT_FILE}")
     print(f"page:    {out / PAGE_FILE}")

@@ -9,15 +9,11 @@ files of another scene are noticed. What has been measured by the same network i
 
 from __future__ import annotations
 
-import sys
-
 from absl import flags
 
 from bavs_jax.metrics.perceptual import NETS
 from experiments import compilation, runtime
-from experiments.errors import USER_ERRORS
 from experiments.posthoc.measures import Wanted, remeasure
-from experiments.report import ReportError
 
 FLAGS = flags.FLAGS
 flags.adopt_module_key_flags(compilation)
@@ -30,11 +26,8 @@ flags.DEFINE_string("data_dir", "", "Folder of scenes, if it has moved since the
 def main() -> None:
     folder = runtime.given_folder("workdir", "the folder of an experiment", exists=True)
     compilation.start_cache()
-    try:
-        wanted = Wanted(FLAGS.lpips_net, FLAGS.policy, FLAGS.data_dir)
-        remeasure(folder, wanted, runtime.command_line())
-    except (*USER_ERRORS, ReportError) as error:
-        sys.exit(f"error: {error}")
+    wanted = Wanted(FLAGS.lpips_net, FLAGS.policy, FLAGS.data_dir)
+    remeasure(folder, wanted, runtime.command_line())
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ The same command goes on with a run that was stopped; with other candidates it u
 from __future__ import annotations
 
 import pathlib
-import sys
 import time
 
 from absl import flags
@@ -20,7 +19,6 @@ from bavs_jax.scenes import LOADERS, load_scene
 from bavs_jax.scenes.pose_files import read_pose_file
 from experiments import compilation, runtime, workdir
 from experiments.build import build_problem
-from experiments.errors import USER_ERRORS
 from experiments.schema import MAX_SEED, MAX_WIDTH, check_config
 from experiments.suggest import choosing, places, results, settings, training
 
@@ -153,12 +151,9 @@ def suggest_views(
 def main() -> None:
     data = runtime.given_folder("data", "the folder of the capture", exists=True)
     folder = runtime.given_folder("workdir", "a folder for the results")
-    try:
-        options, config = read_options(), read_config(data)
-        compilation.start_cache()
-        suggest_views(config, data, folder, options)
-    except USER_ERRORS as error:
-        sys.exit(f"error: {error}")
+    options, config = read_options(), read_config(data)
+    compilation.start_cache()
+    suggest_views(config, data, folder, options)
 
 
 if __name__ == "__main__":

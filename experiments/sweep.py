@@ -18,8 +18,7 @@ from absl import flags
 from ml_collections import config_flags
 
 from experiments import compilation, runtime, workdir
-from experiments.errors import USER_ERRORS
-from experiments.report import ReportError, write_report
+from experiments.report import write_report
 from experiments.schema import check_config, given_config
 from experiments.sweeps import capacity
 from experiments.sweeps.axes import parse_axes
@@ -123,10 +122,7 @@ def main() -> None:
     flag = FLAGS["config"]
     given = [f"--config={config_flags.get_config_filename(flag)}"]
     given += [option_flag(*item) for item in config_flags.get_override_values(flag).items()]
-    try:
-        failed = sweep(config, folder, given)
-    except (*USER_ERRORS, ReportError, OSError) as error:
-        sys.exit(f"error: {' '.join(str(error).split())}")
+    failed = sweep(config, folder, given)
     if failed:
         sys.exit(f"error: {failed} trial{'s' if failed > 1 else ''} failed; reasons are above")
 

@@ -28,7 +28,7 @@ from experiments.bench.quality import first_seconds, measure_run, parse_targets
 from experiments.bench.results import QUALITY, quality_tables
 from experiments.build_scene import load_config_scene
 from experiments.configs import base
-from experiments.errors import USER_ERRORS, ConfigError
+from experiments.errors import ConfigError
 from experiments.files import write_json
 from experiments.machine import versions
 from experiments.report.collected import collected_text
@@ -126,14 +126,11 @@ def main() -> None:
     if (FLAGS.part in CACHES) != (FLAGS.started is not None):
         raise ConfigError("--part and --started: are set by the script itself; leave them out")
     config.lpips_net = ""
-    try:
-        targets = parse_targets(FLAGS.targets)
-        if FLAGS.part is None:
-            compare_caches(config, folder, runtime.command_line())
-        else:
-            run_part(config, folder, FLAGS.part, targets)
-    except USER_ERRORS as error:
-        sys.exit(f"error: {error}")
+    targets = parse_targets(FLAGS.targets)
+    if FLAGS.part is None:
+        compare_caches(config, folder, runtime.command_line())
+    else:
+        run_part(config, folder, FLAGS.part, targets)
 
 
 if __name__ == "__main__":

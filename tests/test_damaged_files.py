@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from bavs_jax.scenes import procedural
-from experiments import active_selection, parts, runtime, workdir
+from experiments import parts, runs, runtime, workdir
 from experiments.errors import ReportError, WorkdirError
 from experiments.files import append_line, read_arrays, read_json, write_arrays, write_json
 from experiments.report import write_report
@@ -30,12 +30,12 @@ PART = "bavs/seed_0"
 def run_all(cache):
     """`run_all(folder)`: the script's work; scene and compiled programs are made once."""
     config = toy_config(policies=("bavs",), **TINY)
-    scene = active_selection.load_config_scene(config, cache_dir=str(cache / "scenes"))
-    problem = active_selection.build_problem(config, scene)
+    scene = runs.load_config_scene(config, cache_dir=str(cache / "scenes"))
+    problem = runs.build_problem(config, scene)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(active_selection, "load_config_scene", lambda *args, **options: scene)
-        patch.setattr(active_selection, "build_problem", lambda *args: problem)
-        yield lambda folder: active_selection.run_all(config, folder, "command", None)
+        patch.setattr(runs, "load_config_scene", lambda *args, **options: scene)
+        patch.setattr(runs, "build_problem", lambda *args: problem)
+        yield lambda folder: runs.run_all(config, folder, "command", None)
 
 
 @pytest.fixture(scope="module")

@@ -152,7 +152,8 @@ def test_list_policies_prints_one_a_line():
         (["--config.no_such_option=1"], "no_such_option"),
     ],
 )
-def test_wrong_options_end_in_one_line(tmp_path, flags, message):
+def test_wrong_options_end_in_one_line(tmp_path, flags, message, monkeypatch):
+    monkeypatch.delenv("BAVS_DATA", raising=False)
     env_flags = [f"--workdir={tmp_path}", *toy_flags(), *flags]
     done = script(*env_flags)
     assert done.returncode != 0

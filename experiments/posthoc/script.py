@@ -6,7 +6,6 @@ checkpoints in --workdir are taken up as they are.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 
 from absl import flags
@@ -15,7 +14,7 @@ from ml_collections import config_flags
 from experiments import compilation, runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import check_views, load_config_scene
-from experiments.errors import USER_ERRORS, ConfigError, one_line
+from experiments.errors import ConfigError
 from experiments.machine import device_name, versions
 from experiments.schema import MAX_SEED, given_config
 from experiments.trained import (
@@ -134,11 +133,6 @@ def run_on_trained(work: Callable[[], None]) -> None:
         given_config()
         runtime.given_folder("workdir", "the folder of a run")
         compilation.start_cache()
-        try:
-            work()
-        except OSError as error:
-            sys.exit(f"error: {one_line(error)}")
-        except USER_ERRORS as error:
-            sys.exit(f"error: {error}")
+        work()
 
     runtime.run_script(main)
