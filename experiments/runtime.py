@@ -37,8 +37,9 @@ def usable_cache(folder: pathlib.Path) -> pathlib.Path | None:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(4096))
-    except OSError as error:
-        warn(f"{folder}: cannot be used ({error.strerror}): goes on without a cache there")
+    except (OSError, ValueError) as error:  # or a name that no folder can have
+        why = getattr(error, "strerror", None) or error
+        warn(f"{shown(str(folder))}: cannot be used ({why}): goes on without a cache there")
         return None
     return folder
 
