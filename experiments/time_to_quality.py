@@ -123,7 +123,7 @@ def compare_caches(config, folder: pathlib.Path, command: str) -> None:
 
 def main() -> None:
     config, folder = given_config(), runtime.given_folder("workdir", "a folder for the results")
-    if (FLAGS.part in CACHES) != (FLAGS.started is not None):
+    if (FLAGS.part is None) != (FLAGS.started is None):
         raise ConfigError("--part and --started: are set by the script itself; leave them out")
     config.lpips_net = ""
     targets = parse_targets(FLAGS.targets)

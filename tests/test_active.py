@@ -192,11 +192,7 @@ def test_hemisphere_pictures_are_taken_trained_on_and_survive_a_checkpoint(tmp_p
 def test_training_on_keeps_the_field_and_training_anew_does_not():
     losses = {}
     for from_scratch in (True, False):
-        config = toy_config(
-            from_scratch=from_scratch,
-            train__random_background=False,
-            field__initial_optical_depth=3.0,  # learns in a few steps
-        )
+        config = toy_config(from_scratch=from_scratch, train__random_background=False)
         problem = build_problem(config, load_config_scene(config, cache_dir=None))
         state, initial = start(problem)
         step = problem.make_step("random", initial, silent, "random")

@@ -20,6 +20,7 @@ OVERRIDES = {
     "field.num_levels": 2,
     "field.finest": 32,
     "field.width": 16,
+    "field.initial_optical_depth": 2.0,  # learns in a few steps
     "march.num_steps": 48,
     "march.num_slots": 32,
     "march.occupancy_resolution": 16,

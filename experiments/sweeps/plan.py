@@ -68,7 +68,10 @@ def make_trials(
     wanted = {part for p in left for part in (p, p.initial)}
     todo = [p for p in setting.parts if p in wanted and not is_finished(setting.folder, p)]
     own = {"policies": setting.config.policies, "seeds": setting.config.seeds, **setting.values}
-    shared = (*config_flags, *(option_flag(name, value) for name, value in own.items()))
+    # A tuple that is given twice would be added up.
+    replaced = {option_flag(name, "") for name in own}
+    kept = [flag for flag in config_flags if f"{flag.partition('=')[0]}=" not in replaced]
+    shared = (*kept, *(option_flag(name, value) for name, value in own.items()))
     trials = []
     for part in todo:
         argv = (*SCRIPT, *shared, f"--workdir={setting.folder}", f"--part={part.name}")
