@@ -184,7 +184,8 @@ def rename(draw, root, layout):
 
 def drop_folder(draw, root, layout):
     folders = sorted(p for p in root.rglob("*") if p.is_dir())
-    shutil.rmtree(draw(st.sampled_from(folders)))
+    if folders:  # an earlier change may have taken the last one
+        shutil.rmtree(draw(st.sampled_from(folders)))
 
 
 # --- JSON, text and arrays -------------------------------------------------------------------

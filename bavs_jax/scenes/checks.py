@@ -193,6 +193,8 @@ def check_target_width(target: int | None, width: int, path: pathlib.Path) -> in
     """The wanted image width in pixels; None asks for the original `width`."""
     if target is None:
         return width
+    if not isinstance(target, int):
+        raise SceneError(f"{path}: image_size {target!r} is no whole number: give one")
     if target < 1 or target > width:
         raise SceneError(f"{path}: image_size {target} is outside of 1 to {width}: choose within")
     return target
