@@ -131,12 +131,7 @@ def _occupancy_sampler(options, scene: Scene) -> Sampler:
         num_steps=options.num_steps,
         num_slots=options.num_slots,
     )
-    return make_occupancy_sampler(
-        scene.box,
-        march_options,
-        resolution=options.occupancy_resolution,
-        distortion_weight=options.distortion_weight,
-    )
+    return make_occupancy_sampler(scene.box, march_options, resolution=options.occupancy_resolution)
 
 
 def _coarse_to_fine_sampler(config, scene: Scene) -> Sampler:

@@ -163,7 +163,6 @@ SCHEMA = {
     "march.num_steps": whole(1, 65536),
     "march.num_slots": SAMPLES,
     "march.occupancy_resolution": whole(1, 512),
-    "march.distortion_weight": WEIGHT,
     "proposal.num_proposals": several(SAMPLES, 1, 8, distinct=False),
     "proposal.num_samples": SAMPLES,
     "proposal.far": number(0.0, MAX_VALUE, open_low=True),

@@ -41,7 +41,21 @@ def test_a_share_is_rounded_to_whole_views(tmp_path, share, num_pool):
     assert len(load_nerfstudio(root, pool_size=share).pool) == num_pool
 
 
-@pytest.mark.parametrize("pool_size", [8, 9, 0, -1, 1.0, 0.0, 1.5])
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [({"image_size": float("nan")}, "no whole number"), ({"test_every": 2.5}, "give 2 or more")],
+)
+def test_options_that_are_no_whole_numbers(tmp_path, option, message):
+    with pytest.raises(SceneError, match=message):
+        load_nerfstudio(write_nerfstudio(tmp_path), **option)
+
+
+def test_however_large_the_step_the_first_view_is_a_test_view(tmp_path):
+    scene = load_nerfstudio(write_nerfstudio(tmp_path), test_every=2**31)
+    assert len(scene.test) == 1 and scene.names[scene.test[0]] == min(scene.names)
+
+
+@pytest.mark.parametrize("pool_size", [8, 9, 0, -1, 2**70, 1.0, 0.0, 1.5, float("nan"), "x"])
 def test_a_split_may_not_be_empty(tmp_path, pool_size):
     with pytest.raises(SceneError, match=f"transforms.json: pool_size {pool_size}"):
         load_nerfstudio(write_nerfstudio(tmp_path), pool_size=pool_size)

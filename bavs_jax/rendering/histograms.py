@@ -90,19 +90,3 @@ def distortion_loss(edges: jax.Array, weights: jax.Array) -> jax.Array:
     between = (weights[..., None] * weights[..., None, :] * distance).sum((-1, -2))
     within = (jnp.square(weights) * jnp.diff(edges, axis=-1)).sum(-1)
     return between + within / 3.0
-
-
-def sample_distortion(t_mids: jax.Array, deltas: jax.Array, weights: jax.Array) -> jax.Array:
-    """`distortion_loss` of samples with gaps between them, [...].
-
-    `sum_ij w_i w_j |t_i - t_j| + 1/3 sum_i w_i^2 delta_i` with rising t: the double sum is
-    `2 sum_i w_i (t_i sum_{j<i} w_j - sum_{j<i} w_j t_j)`.
-
-    Args:
-      t_mids, deltas, weights: [..., S]; weights are 0 in empty slots.
-    """
-    t_mids = t_mids - t_mids[..., :1]  # small numbers: their differences are what counts
-    before = exclusive_cumsum(weights)
-    moment = exclusive_cumsum(weights * t_mids)
-    between = 2.0 * (weights * (t_mids * before - moment)).sum(-1)
-    return between + (jnp.square(weights) * deltas).sum(-1) / 3.0

@@ -10,10 +10,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from bavs_jax.rendering.compositing import render_weights
-from bavs_jax.rendering.histograms import sample_distortion
 from bavs_jax.rendering.occupancy import init_occupancy, update_occupancy
 from bavs_jax.rendering.sampling import (
     MarchOptions,
@@ -46,12 +44,7 @@ class Sampler(NamedTuple):
 
 
 def make_occupancy_sampler(
-    box,
-    options: MarchOptions,
-    *,
-    resolution: int,
-    num_updated: int | None = None,
-    distortion_weight: float = 0.0,
+    box, options: MarchOptions, *, resolution: int, num_updated: int | None = None
 ) -> Sampler:
     """Even steps through the occupied cells of a box.
 
@@ -60,9 +53,7 @@ def make_occupancy_sampler(
       options: spacing and limits of the steps.
       resolution: cells per side of the occupancy grid.
       num_updated: cells looked at in each update; a quarter of all when None.
-      distortion_weight: of `sample_distortion`, distances in half diagonals of the box.
     """
-    unit = 0.5 * float(np.linalg.norm(np.asarray(box)[1] - np.asarray(box)[0]))
     num_updated = num_updated or resolution**3 // 4
 
     def sample(key, params, state, rays):
@@ -76,19 +67,12 @@ def make_occupancy_sampler(
             key, state, density_fn, num_samples=num_updated, step_size=options.step_size
         )
 
-    def loss(aux, samples, weights, colour_loss_fn):
-        del aux, colour_loss_fn
-        if not distortion_weight:
-            return 0.0
-        distortion = sample_distortion(samples.t_mids / unit, samples.deltas / unit, weights)
-        return distortion_weight * distortion.mean()
-
     return Sampler(
         init=lambda key: {},
         init_state=lambda: init_occupancy(box, resolution=resolution),
         sample=sample,
         update=update,
-        loss=loss,
+        loss=lambda aux, samples, weights, colour_loss_fn: 0.0,
         num_slots=options.num_slots,
         dense=False,
     )

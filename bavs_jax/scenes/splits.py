@@ -23,7 +23,7 @@ def random_split(num_views: int, pool_size: int | float, *, seed: int, path: pat
     if isinstance(pool_size, float):
         num_pool = round(pool_size * num_views) if 0.0 < pool_size <= 1.0 else 0
     else:
-        num_pool = pool_size
+        num_pool = pool_size if isinstance(pool_size, int) else 0
     if num_pool < 1:
         raise SceneError(f"{path}: pool_size {pool_size}: give a count or a share in (0, 1)")
     if num_pool >= num_views:
@@ -37,10 +37,10 @@ def random_split(num_views: int, pool_size: int | float, *, seed: int, path: pat
 
 def every_nth(num_views: int, step: int, *, path: pathlib.Path):
     """Pool and test views, int32: of the sorted views 0, step, 2 step, ... are test views."""
-    if step < 2:
+    if not isinstance(step, int) or step < 2:
         raise SceneError(f"{path}: test_every {step}: give 2 or more")
     views = np.arange(num_views, dtype=np.int32)
-    is_test = views % step == 0
+    is_test = views % min(step, num_views) == 0  # the first view alone, however large the step
     if is_test.all():
         raise SceneError(f"{path}: {num_views} views are too few to train and to test: add some")
     return views[~is_test], views[is_test]

@@ -90,7 +90,6 @@ def get_config() -> ConfigDict:
     config.march.num_steps = 192  # steps through the diagonal of the scene box
     config.march.num_slots = 64  # most samples of a ray
     config.march.occupancy_resolution = 64
-    config.march.distortion_weight = 0.0  # of the distortion loss, as in "proposal" below
 
     # --- sampler_kind "proposal" (rendering/proposals.py) ---
     config.proposal = ConfigDict()
