@@ -14,6 +14,7 @@ from collections.abc import Callable
 import jax
 from absl import app, flags, logging
 
+from bavs_jax.scenes.base import printable
 from experiments import signals
 from experiments.errors import USER_ERRORS, ConfigError, one_line, shown
 
@@ -39,7 +40,7 @@ def usable_cache(folder: pathlib.Path) -> pathlib.Path | None:
             file.write(bytes(4096))
     except (OSError, ValueError) as error:  # or a name that no folder can have
         why = getattr(error, "strerror", None) or error
-        warn(f"{shown(str(folder))}: cannot be used ({why}): goes on without a cache there")
+        warn(f"{printable(str(folder))}: cannot be used ({why}): goes on without a cache there")
         return None
     return folder
 
