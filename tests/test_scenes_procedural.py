@@ -96,7 +96,7 @@ def test_detail_is_uneven():
 
 
 def test_depth_equals_brute_force(captured):
-    cameras, _, depth = captured
+    cameras, _, _, depth = captured
     for view in range(2):
         rays = pixel_rays(cameras, np.full(SIZE**2, view), image_pixels(SIZE, SIZE))
         expected, clipped = brute_force_depth(
@@ -111,7 +111,7 @@ def test_depth_equals_brute_force(captured):
 
 
 def test_colour_is_the_mean_over_the_pixel(captured):
-    cameras, pixels, _ = captured
+    cameras, pixels, *_ = captured
     chosen = np.random.default_rng(0).choice(SIZE**2, 120, replace=False)
     centres, ids = image_pixels(SIZE, SIZE)[chosen], np.zeros(len(chosen), int)
     total = np.zeros((len(chosen), 3))
@@ -133,7 +133,7 @@ def test_colour_is_the_mean_over_the_pixel(captured):
 def test_the_field_of_view_holds_the_whole_object(captured):
     silhouette = np.arcsin(sculpture.SCENE_RADIUS / procedural.CAMERA_RADIUS)
     assert silhouette < 0.5 * procedural.FIELD_OF_VIEW
-    _, pixels, depth = captured
+    _, pixels, _, depth = captured
     images, depths = pixels.reshape(-1, SIZE, SIZE, 3), depth.reshape(-1, SIZE, SIZE)
     np.testing.assert_array_equal(images[:, 0, [0, -1]], 255)  # white corners
     np.testing.assert_array_equal(depths[(images == 255).all(axis=-1)], 0.0)

@@ -35,7 +35,13 @@ def trainer():
     """A scene with its field, training function and fresh state."""
     scene = toy_scene()
     field = make_hash_grid_field(
-        scene.box, num_levels=2, coarsest=8, finest=16, width=16, direction_degree=1
+        scene.box,
+        num_levels=2,
+        coarsest=8,
+        finest=16,
+        width=16,
+        direction_degree=1,
+        initial_optical_depth=2.0,  # a fog at first, which shows that something is learnt
     )
     options = make_march_options(
         scene.box, near=scene.near, far=scene.far, num_steps=32, num_slots=24
@@ -213,12 +219,13 @@ def test_training_learns_and_compiles_once_while_views_are_added(trainer):
 def test_the_penalty_pulls_at_the_field_by_its_weight(trainer):
     scene, field, sampler, *_ = trainer
     table, mask = make_pixel_table(scene), jnp.ones(scene.num_views, bool)
-    objective = make_colour_objective(field, background=scene.background, capacity=1024)
+    objective = make_colour_objective(field, capacity=1024)
     tables = {}
     for weight in (0.0, 3.0):
         train = make_train_fn(
             *(field, sampler, objective, optax.sgd(0.5), lambda step: 0.5),
             num_rays=64,
+            background=scene.background,
             penalty_weight=weight,
             steps_per_call=1,
         )
@@ -240,10 +247,13 @@ def test_the_penalty_pulls_at_the_field_by_its_weight(trainer):
 @pytest.mark.parametrize("capacity, num_rays", [(1, 0), (2048, 64)])
 def test_rays_that_did_not_fit_do_not_count_in_the_loss(trainer, capacity, num_rays):
     scene, field, sampler, *_ = trainer
-    objective = make_colour_objective(field, background=scene.background, capacity=capacity)
+    objective = make_colour_objective(field, capacity=capacity)
     optimiser, schedule = make_optimiser(learning_rate=1e-2, final_share=0.3, num_steps=64)
     train = make_train_fn(
-        *(field, sampler, objective, optimiser, schedule), num_rays=64, steps_per_call=1
+        *(field, sampler, objective, optimiser, schedule),
+        num_rays=64,
+        background=scene.background,
+        steps_per_call=1,
     )
     start = init_train_state(jax.random.key(0), field, sampler, optimiser)
     mask = jnp.ones(scene.num_views, bool)

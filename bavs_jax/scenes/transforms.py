@@ -77,7 +77,7 @@ def lens_of(frame: Frame, distortion: list[float]) -> str:
         lens = "fisheye" if frame.get("is_fisheye") is True else inferred  # as instant-ngp says it
     elif not isinstance(model, str) or model not in models.MODELS:
         raise SceneError(
-            f"{frame.path}: {frame.field('camera_model')}: {model!r} is an unknown lens model: "
+            f"{frame.path}: {frame.field('camera_model')}: '{model}' is an unknown lens model: "
             f"use one of {', '.join(models.MODELS)}"
         )
     else:
