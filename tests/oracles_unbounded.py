@@ -29,7 +29,7 @@ def inverse_cdf_loop(edges, weights, places):
 
 
 def interlevel_loop(proposal_edges, proposal_weights, edges, weights):
-    """Mip-NeRF 360, Eqs 12 and 13 for one ray."""
+    """Mip-NeRF 360, Eqs 12 and 13 for one ray, as a mean over its samples."""
     total = 0.0
     for i, weight in enumerate(weights):
         bound = 0.0
@@ -38,7 +38,7 @@ def interlevel_loop(proposal_edges, proposal_weights, edges, weights):
                 bound += proposed
         if weight > 0:
             total += max(0.0, weight - bound) ** 2 / weight
-    return total
+    return total / len(weights)
 
 
 def distortion_loop(edges, weights):

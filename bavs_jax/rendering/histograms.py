@@ -70,13 +70,16 @@ def overlapping_weight(edges: jax.Array, weights: jax.Array, lower, upper) -> ja
 def interlevel_loss(proposal_edges, proposal_weights, edges, weights) -> jax.Array:
     """How far a proposal fails to bound the field's histogram (Mip-NeRF 360, Eq 13), [...].
 
-    `sum_i max(0, w_i - bound_i)^2 / w_i`. It teaches the proposal alone: the field's histogram
+    `mean_i max(0, w_i - bound_i)^2 / w_i`. It teaches the proposal alone: the field's histogram
     counts as given.
+
+    Differs from the paper: a mean over samples, as in the code of Mip-NeRF 360 and of nerfacto,
+    whose weights then mean the same; a sum weighs 32 times as much against the proposals' penalty.
     """
     edges, weights = jax.lax.stop_gradient((edges, weights))
     bound = overlapping_weight(proposal_edges, proposal_weights, edges[..., :-1], edges[..., 1:])
     excess = jnp.maximum(weights - bound, 0.0)
-    return (jnp.square(excess) / (weights + TINY)).sum(-1)
+    return (jnp.square(excess) / (weights + TINY)).mean(-1)
 
 
 def distortion_loss(edges: jax.Array, weights: jax.Array) -> jax.Array:
