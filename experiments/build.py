@@ -123,7 +123,10 @@ def build_problem(
         fresh = trainer.init(key)
         if config.from_scratch:
             return fresh
-        return fresh.replace(params=state.params, sampler_state=state.sampler_state)
+        params = jax.tree.map(jnp.copy, state.params)  # training donates both of them
+        return fresh.replace(
+            params=state.params, last_params=params, sampler_state=state.sampler_state
+        )
 
     def make_toolbox(track: Callable) -> Toolbox:
         def tracked_curvature(state, rays, label, *, weighting, group_ids=None, **of_rays):

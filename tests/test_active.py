@@ -163,7 +163,7 @@ def test_captured_pictures_go_into_empty_views_until_these_are_full():
 def test_a_loss_that_is_not_finite_stops_the_run(problem):
     state, initial = start(problem)
     broken = jax.tree.map(lambda x: x * jnp.nan, state.train.params)
-    state = state.replace(train=state.train.replace(params=broken))
+    state = state.replace(train=state.train.replace(last_params=broken))
     step = problem.make_step("random", initial, silent, "random")
     with pytest.raises(FloatingPointError, match="round 0, training call 0: the loss is nan"):
         step(jax.random.key(0), state)

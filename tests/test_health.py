@@ -78,7 +78,7 @@ def make_step(losses, scene):
 
 
 def fresh(attempt):
-    return TrainState(jnp.int32(0), jnp.int32(attempt), (), ())
+    return TrainState(jnp.int32(0), jnp.int32(attempt), jnp.int32(attempt), (), ())
 
 
 def run(losses):

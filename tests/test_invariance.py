@@ -75,7 +75,8 @@ def toy_train(kind, key, situation):
     """A field of any kind, another one for each key."""
     del kind, situation
     phase = 0.3 * jax.random.normal(key)
-    return TrainState(jnp.int32(0), {"field": {"phase": phase}, "sampler": {}}, None, {})
+    params = {"field": {"phase": phase}, "sampler": {}}
+    return TrainState(jnp.int32(0), params, params, None, {})
 
 
 def random_scene():

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from experiments.bench.quality import first_seconds, parse_targets
+from experiments.bench.quality import first_seconds, parse_targets, plateau
 from experiments.bench.results import QUALITY, quality_tables
 from experiments.errors import ConfigError
 from experiments.report.collected import collected_text
@@ -24,6 +24,20 @@ def test_a_target_is_reached_where_it_is_first_seen():
         for n, s, p in ((1, 2.0, 20.0), (2, 3.0, 25.0), (3, 4.0, 24.0), (4, 5.0, 28.5))
     ]
     assert first_seconds(curve, ["25", "28", "30"]) == {"25": 3.0, "28": 5.0, "30": None}
+
+
+@pytest.mark.parametrize(
+    ("psnrs", "db", "seconds"),
+    [
+        ([20.0, 25.0, 29.75, 29.6, 30.0], 30.0, 5.0),  # 0.4 below once more, at 4 s
+        ([20.0, 29.7, 30.0, 29.8], 30.0, 2.0),  # 0.3 below is near
+        ([20.0, 30.0, 29.0], 30.0, None),
+        ([30.0], 30.0, 1.0),
+    ],
+)
+def test_the_plateau_begins_where_no_later_look_is_further_below_the_best(psnrs, db, seconds):
+    curve = [{"step": n, "seconds": n, "psnr": p} for n, p in enumerate(psnrs, start=1)]
+    assert plateau(curve) == {"db": db, "seconds": seconds}
 
 
 @pytest.mark.slow
@@ -43,6 +57,7 @@ def test_script_measures_with_a_cold_and_a_warm_cache(tmp_path):
         seconds = [point["seconds"] for point in run["curve"]]
         assert 0 < seconds[0] < seconds[1]
         # 5 dB is less than any image in [0, 1] is likely to have; 99 dB is out of reach.
+        assert run["plateau"]["db"] == max(point["psnr"] for point in run["curve"])
         assert run["seconds_to_db"] == {"5": seconds[0], "99": None}
     cold, warm = (run["curve"] for run in result["runs"].values())
     np.testing.assert_allclose(  # the same seed and the same programs

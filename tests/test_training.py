@@ -22,7 +22,12 @@ from bavs_jax.training.batches import (
 from bavs_jax.training.checkpoints import Checkpoints
 from bavs_jax.training.losses import colour_loss
 from bavs_jax.training.objectives import make_colour_objective
-from bavs_jax.training.train import init_train_state, make_optimiser, make_train_fn
+from bavs_jax.training.train import (
+    average_weight,
+    init_train_state,
+    make_optimiser,
+    make_train_fn,
+)
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 from bavs_jax.uncertainty.streaming import make_curvature_fn, table_rays
 from tests.toy_scenes import toy_scene
@@ -92,6 +97,54 @@ def test_optimiser_is_adam_on_gradients_that_are_cut_to_a_norm():
         m_hat, v_hat = m / (1 - 0.9 ** (step + 1)), v / (1 - second_decay ** (step + 1))
         expected = -float(schedule(step)) * m_hat / (np.sqrt(v_hat) + epsilon)
         np.testing.assert_allclose([*updates["a"], *updates["b"]], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("age", [0.05, 0.3, 0.5])
+def test_the_mean_of_parameters_has_its_age_at_every_step(age):
+    """The slow way: all of them kept, a weight for each; once 0.5, all weigh the same."""
+    every, num_calls = 4, 60
+    values = np.random.default_rng(0).normal(size=num_calls)
+    mean, mean_step = 0.0, 0.0
+    for call in range(num_calls):
+        step = jnp.int32((call + 1) * every)
+        weight = float(average_weight(step, every, age))
+        mean += weight * (values[call] - mean)
+        mean_step += weight * (int(step) - mean_step)
+        # Each weighs as much as its steps do: the integral of s^(1 / age - 2) over them.
+        ends = np.arange(call + 2, dtype=np.float64) ** (1 / age - 1)
+        expected = np.average(values[: call + 1], weights=np.diff(ends))
+        np.testing.assert_allclose(mean, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(1 - mean_step / (num_calls * every), age, atol=1 / num_calls)
+
+
+def test_training_renders_the_mean_and_goes_on_from_the_last_parameters(trainer):
+    scene, field, sampler, _, fresh = trainer
+    optimiser, schedule = make_optimiser(learning_rate=1e-2, final_share=0.3, num_steps=64)
+    mask = jnp.ones(scene.num_views, bool)
+    last = {}
+    for age in (0.0, 0.2):
+        train = make_train_fn(
+            field,
+            sampler,
+            make_colour_objective(field, capacity=1024),
+            *(optimiser, schedule),
+            num_rays=64,
+            background=scene.background,
+            average_age=age,
+            steps_per_call=4,
+        )
+        state, path = fresh(), []
+        for call in range(3):
+            key = jax.random.fold_in(jax.random.key(0), call)
+            state, _ = train(key, state, make_pixel_table(scene), mask)
+            path.append(jax.tree.map(np.asarray, state.last_params))
+        last[age] = path[-1]
+        ends = np.arange(4.0) ** (1 / age - 1) if age else np.array([0.0, 0.0, 0.0, 1.0])
+        weights = np.diff(ends) / ends[-1]
+        mean = jax.tree.map(lambda *x, w=weights: np.tensordot(w, np.stack(x), 1), *path)
+        close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6)
+        jax.tree.map(close, state.params, mean)
+    jax.tree.map(np.testing.assert_array_equal, last[0.0], last[0.2])
 
 
 def test_sampled_pixels_come_from_training_views_alone_and_from_all_of_them(trainer):

@@ -24,7 +24,8 @@ class TrainState:
     """What must be carried from one optimiser step to the next."""
 
     step: jax.Array  # [] int32, optimiser steps since the parameters were drawn
-    params: dict[str, Any]  # "field" and "sampler", both trained
+    params: dict[str, Any]  # "field" and "sampler", both trained; the mean of the last steps'
+    last_params: dict[str, Any]  # those of the last step, which the optimiser goes on from
     opt_state: optax.OptState
     sampler_state: Any  # what the sampler carries untrained, such as an occupancy grid
 
@@ -87,9 +88,24 @@ def init_train_state(key, field: Field, sampler: Sampler, optimiser) -> TrainSta
     return TrainState(
         step=jnp.int32(0),
         params=params,
+        last_params=jax.tree.map(jnp.copy, params),  # `train` donates both
         opt_state=optimiser.init(params),
         sampler_state=sampler.init_state(),
     )
+
+
+def average_weight(step: jax.Array, num_steps: int, age: float) -> jax.Array:
+    """Weight of the newest parameters in the mean of those of steps 1 to `step`, [].
+
+    The mean weighs step s by `s^(1 / age - 2)`, so that its mean age is `age * step`: it forgets
+    the beginning at whatever step it is looked at (Karras et al. 2024, Eq 7).
+
+    Args:
+      step: t, of the newest.
+      num_steps: since the parameters before them.
+      age: in (0, 0.5].
+    """
+    return 1.0 - (1.0 - num_steps / step) ** (1.0 / age - 1.0)
 
 
 def make_train_fn(
@@ -103,6 +119,7 @@ def make_train_fn(
     background=None,
     random_background: bool = False,
     penalty_weight: float = 0.0,
+    average_age: float = 0.0,
     steps_per_call: int = 16,
     mesh: Mesh | None = None,
 ) -> Callable:
@@ -116,6 +133,8 @@ def make_train_fn(
       num_rays: R, rays of one step.
       background, random_background: what rays end at; see `sample_pixels`.
       penalty_weight: of the field's own penalty.
+      average_age: mean age of the parameters that are rendered, as a share of the steps done
+        (see `average_weight`); 0 renders the last ones.
       steps_per_call: optimiser steps compiled together.
       mesh: devices that share the rays (see `devices.py`); the objective must have the same.
 
@@ -148,17 +167,17 @@ def make_train_fn(
 
     def one_step(state, key, table, is_training_view):
         (_, report), grads = jax.value_and_grad(loss_fn, has_aux=True)(
-            state.params, key, state.sampler_state, table, is_training_view
+            state.last_params, key, state.sampler_state, table, is_training_view
         )
-        updates, opt_state = optimiser.update(grads, state.opt_state, state.params)
-        params = optax.apply_updates(state.params, updates)
-        state = state.replace(step=state.step + 1, params=params, opt_state=opt_state)
+        updates, opt_state = optimiser.update(grads, state.opt_state, state.last_params)
+        params = optax.apply_updates(state.last_params, updates)
+        state = state.replace(step=state.step + 1, last_params=params, opt_state=opt_state)
         return state, report
 
     @partial(jax.jit, donate_argnums=1)
     def train(key, state, table, is_training_view):
         update_key, steps_key = jax.random.split(key)
-        density_fn = partial(field.density, state.params["field"])
+        density_fn = partial(field.density, state.last_params["field"])
         state = state.replace(
             sampler_state=sampler.update(update_key, state.sampler_state, density_fn, state.step)
         )
@@ -168,6 +187,11 @@ def make_train_fn(
             state,
             jax.random.split(steps_key, steps_per_call),
         )
+        params = state.last_params
+        if average_age:
+            weight = average_weight(state.step, steps_per_call, average_age)
+            params = jax.tree.map(lambda mean, x: mean + weight * (x - mean), state.params, params)
+        state = state.replace(params=params)
         means = jax.tree.map(lambda x: x.astype(jnp.float32).mean(), reports)
         return gather_rays((state, TrainInfo(**means, learning_rate=rate)), mesh)
 

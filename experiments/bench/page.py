@@ -68,7 +68,8 @@ def quality_sections(result: dict) -> list[Section]:
             title="Seconds to quality",
             note=f"From the start of the process, with all imports and compilation, on "
             f"{result['num_views']} training views; PSNR is the mean over "
-            f"{result['num_test_views']} test views, measured while the clock stands.",
+            f"{result['num_test_views']} test views, measured while the clock stands. The last "
+            "time is that of the first look from which on none is 0.3 dB below the best.",
             plots=[plots.quality_plot(result)],
             table=quality_table(result),
         )

@@ -19,6 +19,8 @@ from experiments.keys import run_key, stream_key
 from experiments.machine import device_name
 from experiments.progress import track
 
+NEAR = 0.3  # dB below the plateau, from where on a field counts as done
+
 
 def parse_targets(texts: list[str]) -> list[str]:
     """PSNRs in dB as they were given, the smallest first.
@@ -35,17 +37,14 @@ def parse_targets(texts: list[str]) -> list[str]:
     return sorted(texts, key=float)
 
 
-def measure_run(
-    config, *, num_views: int, num_test_views: int, every: int, last_target: float, started: float
-) -> dict:
-    """Trains as a run does and looks at test views on the way, until the last target is reached.
+def measure_run(config, *, num_views: int, num_test_views: int, every: int, started: float) -> dict:
+    """Trains as a run does, to the end of its round, and looks at test views on the way.
 
     Args:
       config: see `experiments/configs/base.py`.
       num_views: training views, drawn as those that a run begins with.
       num_test_views: evenly spaced in the test split.
       every: optimiser steps between two looks, rounded up to compiled calls.
-      last_target: dB.
       started: `time.time()` when the clock began.
 
     Returns:
@@ -67,8 +66,7 @@ def measure_run(
             nonlocal paused
             calls = int(state.calls)
             is_last = calls == problem.calls_per_round
-            reached = curve and curve[-1]["psnr"] >= last_target
-            if not reached and (calls % calls_between == 0 or is_last):
+            if calls % calls_between == 0 or is_last:
                 jax.block_until_ready(state.train)
                 stopped = time.time()
                 measures = evaluate_views(problem.render(state.train), scene, view_ids)
@@ -85,6 +83,19 @@ def measure_run(
         "device": device_name(),
         "num_test_views": len(view_ids),
     }
+
+
+def plateau(curve: list[dict]) -> dict[str, float]:
+    """The best PSNR of a curve, and seconds until it comes within `NEAR` dB of it for good.
+
+    Returns:
+      `db`, and `seconds` of the first look from which on none is further below.
+    """
+    best = max(point["psnr"] for point in curve)
+    below = [i for i, point in enumerate(curve) if point["psnr"] < best - NEAR - 1e-6]
+    if below and below[-1] + 1 == len(curve):  # it has fallen since, and stays there
+        return {"db": best, "seconds": None}
+    return {"db": best, "seconds": curve[below[-1] + 1 if below else 0]["seconds"]}
 
 
 def first_seconds(curve: list[dict], targets: list[str]) -> dict[str, float | None]:
