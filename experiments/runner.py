@@ -50,7 +50,8 @@ class Run:
         self.label = f"{policy or 'initial'} seed {seed}"
         self.part = Part(policy, problem.kind, seed)
         self.folder = workdir / self.part.name
-        self.initial = initial_views(problem.scene, seed, config.num_initial)
+        view_seed = int(config.view_seed or seed)
+        self.initial = initial_views(problem.scene, view_seed, config.num_initial)
         self.rounds: list[dict] = []  # of result.json
         self.pending = _new_pending()  # what is known of the round under way
         self._is_restored = False  # whether a checkpoint was there

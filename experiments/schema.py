@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -95,6 +96,11 @@ LAYERS, WIDTH, SAMPLES, RESOLUTION = whole(1, 64), whole(1, 4096), whole(1, 4096
 TABLE = whole(1, 24)  # 16 million rows
 
 
+def _is_seed_text(value) -> bool:
+    digits = type(value) is str and re.fullmatch("[0-9]{1,10}", value)
+    return bool(digits) and int(value) <= MAX_SEED
+
+
 def _views(zero: str = "") -> Option:
     return whole(1, 100_000, zero)
 
@@ -120,6 +126,10 @@ SCHEMA = {
     "policies": several(choice(*POLICIES), 1, len(POLICIES)),
     "seeds": several(SEED, 1, 10_000),
     "num_initial": _views("all of the pool"),
+    "view_seed": Option(
+        f"a whole number from 0 to {MAX_SEED:,} as text, or '': each seed its own",
+        lambda value: value == "" or _is_seed_text(value),
+    ),
     "batch_size": _views(),
     "num_rounds": whole(0, 10_000),
     "from_scratch": FLAG,

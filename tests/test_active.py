@@ -20,7 +20,7 @@ from bavs_jax.training.checkpoints import Checkpoints
 from experiments.build import build_problem
 from experiments.build_scene import initial_views, load_config_scene
 from experiments.progress import track
-from experiments.runner import saved_part, whole_state
+from experiments.runner import Run, saved_part, whole_state
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 from tests.traces import count_traces
@@ -118,6 +118,16 @@ def test_initial_views_depend_on_the_seed_alone_and_too_many_are_an_error():
     assert set(initial_views(scene, 0, 9)) == set(scene.pool.tolist())
     with pytest.raises(ValueError, match="num_initial is 10, but the pool has 9"):
         initial_views(scene, 0, 10)
+
+
+def test_with_a_view_seed_all_seeds_begin_with_its_views(problem, tmp_path):
+    views = {}
+    for view_seed in ("", "1"):
+        config = toy_config(view_seed=view_seed)
+        views[view_seed] = [
+            Run(config, problem, tmp_path, None, s).initial.tolist() for s in (0, 1)
+        ]
+    assert views["1"] == [views[""][1]] * 2 and views[""][0] != views[""][1]
 
 
 def test_hemisphere_draws_snap_to_the_nearest_unused_views():

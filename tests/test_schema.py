@@ -130,6 +130,7 @@ def test_an_option_that_is_a_group_or_missing_or_unknown_is_named():
         ("uncertainty.log2_cells", 12, "is 12; give a whole number from 1 to 9 \\(a grid of 2\\^9"),
         ("image_size", 100_000, "is 100000; give a whole number from 1 to 8,192, or 0: as the"),
         ("candidates.image_scale", -1.0, r"is -1\.0; give a number above 0 to 1"),
+        ("view_seed", "4294967296", "is '4294967296'; give a whole number from 0 to 4,294,967,295"),
         ("lpips_net", "nonsense", "is 'nonsense'; give one of '', 'alex', 'vgg'"),
         ("policies", ("bavs", "bavs"), "each once"),
         ("policies", ("bavz",), "'bavs'"),

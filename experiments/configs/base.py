@@ -25,6 +25,7 @@ def get_config() -> ConfigDict:
     config.policies = ("bavs", "random")  # see --list_policies; the first one's views are exported
     config.seeds = (0,)
     config.num_initial = 4  # views, drawn from the pool by seed and scene alone; 0: all of them
+    config.view_seed = ""  # a seed whose initial views all others begin with; "": each its own
     config.batch_size = 4  # views chosen at once
     config.num_rounds = 2  # batches after the initial views; 1 is the paper's single iteration
     config.from_scratch = True  # train anew in each round, or train on
