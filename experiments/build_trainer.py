@@ -91,6 +91,7 @@ def build_trainer(
         background=field_background(scene),
         random_background=train.random_background,
         penalty_weight=train.penalty_weight,
+        roughness_weight=train.roughness_weight,
         average_age=train.average_age,
         steps_per_call=train.steps_per_call,
         mesh=mesh,

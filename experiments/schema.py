@@ -195,6 +195,7 @@ SCHEMA = {
     "train.adam_b2": number(0.0, 1.0, open_high=True),
     "train.adam_eps": number(0.0, 1.0, open_low=True),
     "train.penalty_weight": WEIGHT,
+    "train.roughness_weight": number(0.0, MAX_VALUE),
     "train.average_age": number(0.0, 0.5, "the last parameters", open_low=True),
     "train.random_background": FLAG,
     "train.steps_per_call": whole(1, 100_000),

@@ -9,7 +9,7 @@ import optax
 import pytest
 
 from bavs_jax.fields.deformation import DeformationGrid
-from bavs_jax.fields.hash_grid import make_hash_grid_field
+from bavs_jax.fields.hash_grid import make_hash_grid_field, table_roughness
 from bavs_jax.rendering.samplers import make_occupancy_sampler
 from bavs_jax.rendering.sampling import make_march_options
 from bavs_jax.training.batches import (
@@ -284,9 +284,8 @@ def test_the_penalty_pulls_at_the_field_by_its_weight(trainer):
         )
         start = init_train_state(jax.random.key(0), field, sampler, optax.sgd(0.5))
         before = jax.tree.map(lambda x: 1e3 * x, start.params["field"]["encoding"])
-        start = start.replace(
-            params=start.params | {"field": start.params["field"] | {"encoding": before}}
-        )
+        params = start.params | {"field": start.params["field"] | {"encoding": before}}
+        start = start.replace(last_params=params)
         before = jax.tree.map(np.asarray, before)
         after, _ = train(jax.random.key(1), start, table, mask)
         tables[weight] = jax.tree.map(np.asarray, after.params["field"]["encoding"])
@@ -295,6 +294,48 @@ def test_the_penalty_pulls_at_the_field_by_its_weight(trainer):
         expected = -0.5 * 3.0 * 2.0 * entries / entries.size
         assert np.abs(expected).max() > 1e-5
         np.testing.assert_allclose(tables[3.0][name] - tables[0.0][name], expected, atol=1e-7)
+
+
+def test_roughness_is_the_variation_of_dense_levels_and_counts_by_training_pixels(trainer):
+    scene, field, sampler, *_ = trainer
+    params = field.init(jax.random.key(0))
+    rng = np.random.default_rng(0)
+    tables = {k: rng.normal(size=x.shape) for k, x in params["encoding"].items()}
+    expected = 0.0
+    for side, table in zip((9, 17), tables.values()):
+        assert len(table) == side**3
+        grid = table.reshape(side, side, side, 2)
+        for axis in range(3):
+            near = np.moveaxis(grid, axis, 0)
+            expected += np.mean([(near[i + 1] - near[i]) ** 2 for i in range(side - 1)])
+    rough = params | {"encoding": jax.tree.map(jnp.asarray, tables)}
+    np.testing.assert_allclose(field.roughness(rough), expected, rtol=1e-5)
+    hashed = table_roughness({"level_0": jnp.ones((16, 2)).at[0].set(9.0)}, (8,))
+    assert float(hashed) == 0.0  # a table without neighbours
+
+    start = init_train_state(jax.random.key(0), field, sampler, optax.sgd(1.0))
+    start = start.replace(last_params=start.last_params | {"field": rough})
+    slope = jax.grad(lambda p: field.roughness(p))(rough)["encoding"]
+    table, moved = make_pixel_table(scene), {}
+    for weight in (0.0, 500.0):
+        for num_views in (2, 5):
+            train = make_train_fn(
+                *(field, sampler, make_colour_objective(field, capacity=1024)),
+                *(optax.sgd(1.0), lambda step: 1.0),
+                num_rays=64,
+                background=scene.background,
+                roughness_weight=weight,
+                steps_per_call=1,
+            )
+            mask = jnp.arange(scene.num_views) < num_views
+            after, _ = train(jax.random.key(1), jax.tree.map(jnp.copy, start), table, mask)
+            moved[weight, num_views] = after.params["field"]["encoding"]
+    for num_views in (2, 5):
+        num_pixels = num_views * np.prod(scene.cameras.sizes[0])
+        for name in slope:
+            got = moved[500.0, num_views][name] - moved[0.0, num_views][name]
+            want = -500.0 / num_pixels * slope[name]
+            np.testing.assert_allclose(got, want, atol=2e-6, rtol=1e-3)
 
 
 @pytest.mark.parametrize("capacity, num_rays", [(1, 0), (2048, 64)])

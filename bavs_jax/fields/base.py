@@ -22,6 +22,7 @@ class Field(NamedTuple):
       and as a third a dict of whatever else the field says of each point, such as a variance
     `density(params, positions [K, 3], **inputs) -> density [K]`
     `penalty(params) -> []`, what training adds to the loss, times a weight
+    `roughness(params) -> []`, how much the field varies from place to place, another such term
     `inputs(rays, samples [R, S], view_ids [R] or None) -> {name: [R, S, ...]}`, what more the
       field reads at each sample: the size of a pixel's cone there, or the view it belongs to.
       `view_ids` are given only where the views are trained on.
@@ -37,6 +38,7 @@ class Field(NamedTuple):
     penalty: Callable[[Params], Any] = lambda params: 0.0
     inputs: Callable[..., dict] = no_inputs
     reads_views: bool = False
+    roughness: Callable[[Params], Any] = lambda params: 0.0
 
 
 class DensityField(NamedTuple):

@@ -160,7 +160,9 @@ def make_hash_grid_field(
 
     has_codes = appearance_features > 0
     return Field(
-        *(init, apply, density, penalty, inputs if has_codes else no_inputs), reads_views=has_codes
+        *(init, apply, density, penalty, inputs if has_codes else no_inputs),
+        reads_views=has_codes,
+        roughness=lambda params: table_roughness(params["encoding"], module.resolutions),
     )
 
 
@@ -171,6 +173,25 @@ def table_penalty(tables: dict) -> jax.Array:
     fine one (Barron et al. 2023, section 5).
     """
     return sum(jnp.square(table).mean() for table in tables.values())
+
+
+def table_roughness(tables: dict, resolutions: tuple[int, ...]) -> jax.Array:
+    """Squared total variation, `sum_level sum_axis mean (e(vertex + axis) - e(vertex))^2`.
+
+    Only of levels that are stored densely; a hashed table has no neighbours. What no ray has seen
+    is then filled in from around it, instead of with whatever training left there.
+
+    Args:
+      tables: of `HashEncoding`, `{"level_0": [T, F], ...}`.
+      resolutions: cells per side of each level.
+    """
+    total = jnp.float32(0.0)
+    for level, resolution in enumerate(resolutions):
+        table, side = tables[f"level_{level}"], resolution + 1
+        if len(table) == side**3:
+            grid = table.reshape(side, side, side, -1)
+            total += sum(jnp.square(jnp.diff(grid, axis=axis)).mean() for axis in range(3))
+    return total
 
 
 class HashGridDensity(nn.Module):

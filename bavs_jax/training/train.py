@@ -119,6 +119,7 @@ def make_train_fn(
     background=None,
     random_background: bool = False,
     penalty_weight: float = 0.0,
+    roughness_weight: float = 0.0,
     average_age: float = 0.0,
     steps_per_call: int = 16,
     mesh: Mesh | None = None,
@@ -133,6 +134,8 @@ def make_train_fn(
       num_rays: R, rays of one step.
       background, random_background: what rays end at; see `sample_pixels`.
       penalty_weight: of the field's own penalty.
+      roughness_weight: of the field's roughness, for one training pixel: as a prior should, it
+        counts the less the more pixels there are.
       average_age: mean age of the parameters that are rendered, as a share of the steps done
         (see `average_weight`); 0 renders the last ones.
       steps_per_call: optimiser steps compiled together.
@@ -163,6 +166,9 @@ def make_train_fn(
             "thinned": samples.thinned.mean(),
         }
         penalty = penalty_weight * field.penalty(params["field"])
+        if roughness_weight:
+            num_pixels = jnp.where(is_training_view, jnp.diff(table.offsets), 0).sum()
+            penalty += roughness_weight / num_pixels * field.roughness(params["field"])
         return outcome.loss + sampler_loss + penalty, report
 
     def one_step(state, key, table, is_training_view):

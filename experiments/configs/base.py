@@ -120,6 +120,7 @@ def get_config() -> ConfigDict:
     config.train.adam_b2 = 0.99
     config.train.adam_eps = 1e-15
     config.train.penalty_weight = 0.1  # of the field's own penalty: hash tables stay small
+    config.train.roughness_weight = 4000.0  # of coarse hash levels, over all training pixels
     config.train.average_age = 0.07  # of what is rendered, as share of the steps done; 0: the last
     config.train.steps_per_call = 16  # compiled together
 
