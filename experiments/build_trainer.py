@@ -25,6 +25,7 @@ from bavs_jax.training.train import TrainState, init_train_state, make_optimiser
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE, Situation
 from experiments.build_field import build_field, build_flow, field_background, learning_rate
 from experiments.errors import ConfigError
+from experiments.runtime import warn
 
 
 class Trainer(NamedTuple):
@@ -139,6 +140,10 @@ def train_aside(
                 if number + 1 == check and attempt < MAX_RESTARTS:
                     spread = colour_spread(situation.table, situation.is_training_view)
                     if is_stuck(info, spread):
+                        warn(
+                            f"{situation.label}: the {kind} field is stuck: trained anew with "
+                            f"another key ({attempt + 1})"
+                        )
                         break
             else:
                 return state

@@ -1,5 +1,7 @@
 """Fields that learn nothing begin anew, a stated number of times, and are never told as results."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +13,13 @@ from bavs_jax.selection.policies import get_policy
 from bavs_jax.training.batches import make_pixel_table
 from bavs_jax.training.health import MAX_RESTARTS, check_call, colour_spread, is_stuck
 from bavs_jax.training.train import TrainInfo, TrainState
+from bavs_jax.uncertainty.model import Situation
+from experiments.build_trainer import Trainer, train_aside
+from experiments.progress import track
 from experiments.report.results import Run
 from experiments.report.tables import final_table
+from experiments.suggest.training import train_field
+from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 
 CALLS, CHECK = 6, 3
@@ -118,6 +125,65 @@ def test_a_round_that_was_restarted_goes_on_from_a_checkpoint_alike():
     state, _ = step(jax.random.key(0), half)
     assert not inits and rest == whole[-len(rest) :] and len(rest) == CALLS - 2
     assert int(state.restarts) == 1
+
+
+class KilledError(Exception):
+    pass
+
+
+def test_a_capture_whose_field_was_stuck_goes_on_with_its_count_after_a_kill(tmp_path, capsys):
+    """The second attempt is cut off; started again, it ends as if it had not been."""
+    scene = toy_scene(num_views=4, num_test=1)
+    config = toy_config(train__steps_per_call=1)
+    ends, keys = {}, {}
+    for name, last in (("whole", None), ("cut", CHECK + 2)):
+        step, _, keys[name] = make_step([1.0, 0.001], scene)
+
+        def cut_step(key, state, on_choice, on_call, step=step, last=last, keys=keys[name]):
+            def counted(state, info):
+                on_call(state, info)
+                if len(keys) == last:
+                    raise KilledError
+
+            return step(key, state, on_choice, counted)
+
+        problem = SimpleNamespace(
+            scene=scene,
+            table=make_pixel_table(scene),
+            init_train=lambda key: fresh(0),
+            calls_per_round=CALLS,
+            make_step=lambda *args, cut_step=cut_step: cut_step,
+        )
+        if last:
+            with pytest.raises(KilledError):
+                train_field(config, problem, tmp_path / name, seed=0)
+        ends[name] = train_field(config, problem, tmp_path / name, seed=0)
+    assert keys["cut"] == keys["whole"] and len(keys["whole"]) == CHECK + CALLS
+    assert [int(end.params) for end in ends.values()] == [1, 1]
+    assert "the field is stuck: trained anew with another key (1)" in capsys.readouterr().err
+
+
+def test_a_field_trained_aside_begins_anew_and_says_so(capsys):
+    scene, losses, keys, inits = toy_scene(num_views=4, num_test=1), [1.0, 0.001], [], []
+    config = toy_config(train__num_steps=1024, train__steps_per_call=128)  # looked at after 2 of 8
+
+    def init(key):
+        inits.append(key)
+        return fresh(len(inits) - 1)
+
+    def call(key, train, table, is_training_view):
+        keys.append(jax.random.key_data(key).tolist())
+        return train.replace(step=train.step + 1), report(losses[int(train.params)])
+
+    is_training = np.array([True, True, False, False, False])
+    situation = Situation(fresh(0), make_pixel_table(scene), is_training, 0, label="toy")
+    trainer = Trainer(None, None, init, call, None)
+    state = train_aside(config, trainer, jax.random.key(0), situation, "variance", track)
+    assert int(state.params) == 1 and int(state.step) == 8 and len(keys) == 2 + 8
+    assert len({tuple(key) for key in keys}) == 10
+    assert "toy: the variance field is stuck: trained anew with another key (1)" in (
+        capsys.readouterr().err
+    )
 
 
 def test_a_table_marks_policies_with_a_stuck_field(tmp_path):

@@ -49,7 +49,9 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
     found = checkpoints.restore(state.train)
     if found is not None:
         saved, meta = found
-        state = state.replace(train=saved, calls=jnp.int32(meta["calls"]))
+        state = state.replace(
+            train=saved, calls=jnp.int32(meta["calls"]), restarts=jnp.int32(meta["restarts"])
+        )
     left = problem.calls_per_round - int(state.calls)
     if left > 0:
         saved_at = time.monotonic()
@@ -59,10 +61,13 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
                 nonlocal saved_at
                 loss = float(info.loss)
                 bar.advance(steps, loss=loss, psnr=-10.0 * np.log10(loss))
-                calls = int(state.calls)
+                calls, restarts = int(state.calls), int(state.restarts)
+                if calls == 0:
+                    warn(f"the field is stuck: trained anew with another key ({restarts})")
                 due = time.monotonic() - saved_at > config.checkpoint_seconds
                 if due or calls == problem.calls_per_round:
-                    checkpoints.save(calls, state.train, {"calls": calls})
+                    number = restarts * (problem.calls_per_round + 1) + calls
+                    checkpoints.save(number, state.train, {"calls": calls, "restarts": restarts})
                     saved_at = time.monotonic()
 
             step = problem.make_step("bavs", pool, track, "suggest")
