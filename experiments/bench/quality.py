@@ -85,17 +85,17 @@ def measure_run(config, *, num_views: int, num_test_views: int, every: int, star
     }
 
 
-def plateau(curve: list[dict]) -> dict[str, float]:
+def plateau(curve: list[dict]) -> dict[str, float | None]:
     """The best PSNR of a curve, and seconds until it comes within `NEAR` dB of it for good.
 
     Returns:
-      `db`, and `seconds` of the first look from which on none is further below.
+      `db`, and `seconds` of the first look from which on none is further below; None if even
+      the last one is.
     """
     best = max(point["psnr"] for point in curve)
     below = [i for i, point in enumerate(curve) if point["psnr"] < best - NEAR - 1e-6]
-    if below and below[-1] + 1 == len(curve):  # it has fallen since, and stays there
-        return {"db": best, "seconds": None}
-    return {"db": best, "seconds": curve[below[-1] + 1 if below else 0]["seconds"]}
+    near = curve[below[-1] + 1 :] if below else curve
+    return {"db": best, "seconds": near[0]["seconds"] if near else None}
 
 
 def first_seconds(curve: list[dict], targets: list[str]) -> dict[str, float | None]:

@@ -76,10 +76,10 @@ def quality_table(result: dict) -> Table:
     targets = list(next(iter(result["runs"].values()))["seconds_to_db"])
     rows = []
     for cache, run in result["runs"].items():
-        reached = run["seconds_to_db"]
-        why = f"not reached: {max(p['psnr'] for p in run['curve']):.2f} dB at most"
+        reached, best = run["seconds_to_db"], run["plateau"]["db"]
+        why = f"not reached: {best:.2f} dB at most"
         cells = [dash(why) if reached[t] is None else Cell(seconds(reached[t])) for t in targets]
-        best, ending = run["plateau"]["db"], run["plateau"]["seconds"]
+        ending = run["plateau"]["seconds"]
         cells.append(dash("falls again") if ending is None else Cell(seconds(ending)))
         rows.append((Cell(f"{cache} compilation cache"), *cells, Cell(f"{best:.2f}")))
     head = ("start", *(f"to {t} dB" for t in targets), "to 0.3 dB below the best", "best PSNR (dB)")
