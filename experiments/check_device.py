@@ -2,18 +2,18 @@
 
     python -m experiments.check_device --workdir=runs/check_device
 
-Trains each kind of field for a moment on the CPU, hands its state to both devices, and compares what
-they make of it: one more step's loss and gradient, images, curvature, scores, and the views that are
-chosen. Differences are `|a - b| / |b|` with Euclidean norms over all values. Ends with an error where
-one is above `--tolerance`, or other views are chosen. JAX multiplies matrices with fewer digits on
-some accelerators; JAX_DEFAULT_MATMUL_PRECISION=highest in the environment asks for all.
+Trains each kind of field for a moment on the CPU, hands its state to both devices, and compares
+what they make of it: one more step's loss and gradient, images, curvature, scores, and the views
+that are chosen. Differences are `|a - b| / |b|` with Euclidean norms over all values. Ends with an
+error where one is above `--tolerance`, or other views are chosen. JAX multiplies matrices with
+fewer digits on some accelerators; JAX_DEFAULT_MATMUL_PRECISION=highest in the environment asks for
+all of them.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import sys
-import time
 
 import jax
 import jax.numpy as jnp
@@ -43,15 +43,16 @@ from experiments.progress import track
 FLAGS = flags.FLAGS
 flags.DEFINE_string("workdir", None, "Folder for check_device.json.")
 flags.DEFINE_float("tolerance", 1e-4, "Largest relative difference.", 0.0)
+flags.DEFINE_list("fields", [], "Which fields to check; all of them if left out.")
 
 # Fields of each kind: options of the config, whether the scene has no bounds, and what is trained.
 FIELDS = {
     "hash_grid": ({}, False, RECONSTRUCTION),
-    "hash_grid, proposals": ({"sampler_kind": "proposal"}, False, RECONSTRUCTION),
-    "hash_grid, unbounded": ({"field.appearance_features": 2}, True, RECONSTRUCTION),
+    "proposals": ({"sampler_kind": "proposal"}, False, RECONSTRUCTION),
+    "unbounded": ({"field.appearance_features": 2}, True, RECONSTRUCTION),
     "nerf_mlp": ({"field_kind": "nerf_mlp"}, False, RECONSTRUCTION),
     "mip_mlp": ({"field_kind": "mip_mlp"}, False, RECONSTRUCTION),
-    "learned variance": ({}, False, VARIANCE),
+    "learned_variance": ({}, False, VARIANCE),
     "flow": ({}, False, FLOW),
 }
 SMALL = {
@@ -126,11 +127,11 @@ def numbers_on(
             calls=jnp.int32(problem.calls_per_round)
         )
         for name in policies:
+            choices = []
             step = problem.make_step(name, initial, track, "check")
-            step(
-                key, whole, lambda state, choice: found.update({f"views, {name}": choice.view_ids})
-            )
-        # The first mean of Adam's is the gradient times one minus its decay. Last: it takes the state.
+            step(key, whole, lambda state, choice, to=choices: to.append(choice))
+            found[f"views, {name}"] = choices[0].view_ids
+        # Adam's first mean is a share of the gradient. Last, since the state is given away.
         state = state.replace(opt_state=trainer.init(init_key).opt_state)
         state, info = trainer.call(jax.random.fold_in(key, NUM_STEPS), state, table, is_training)
         moments = jax.tree.leaves(optax.tree_utils.tree_get(state.opt_state, "mu"))
@@ -147,55 +148,59 @@ def difference(value: np.ndarray, wanted: np.ndarray) -> float:
     return float(np.linalg.norm(value - wanted) / np.linalg.norm(wanted))
 
 
-def check_fields(device, reference) -> dict[str, dict[str, float]]:
-    """Differences between two devices, by field and by what is compared."""
-    found = {}
-    with track(len(FIELDS), "check", "fields") as bar:
-        for name, (options, unbounded, kind) in FIELDS.items():
-            config = base.get_config()
-            config.update_from_flattened_dict({**SMALL, **options})
-            scene = load_config_scene(config, cache_dir=runtime.scene_cache())
-            scene = dataclasses.replace(scene, unbounded=unbounded)
-            policies = () if options or kind != RECONSTRUCTION else POLICIES
-            trained, wanted = numbers_on(reference, config, scene, kind, policies)
-            _, numbers = numbers_on(device, config, scene, kind, policies, trained)
-            found[name] = {key: difference(numbers[key], wanted[key]) for key in wanted}
-            bar.advance(1)
-    return found
+def check_field(name: str, device, reference) -> dict[str, float]:
+    """Differences between two devices, by what is compared; `name` is one of `FIELDS`."""
+    options, unbounded, kind = FIELDS[name]
+    config = base.get_config()
+    config.update_from_flattened_dict({**SMALL, **options})
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
+    scene = dataclasses.replace(scene, unbounded=unbounded)
+    policies = () if options or kind != RECONSTRUCTION else POLICIES
+    trained, wanted = numbers_on(reference, config, scene, kind, policies)
+    _, numbers = numbers_on(device, config, scene, kind, policies, trained)
+    return {key: difference(numbers[key], wanted[key]) for key in wanted}
+
+
+def too_large(differences: dict[str, dict[str, float]], tolerance: float) -> list[str]:
+    """`field: what` of all that is above the tolerance; of views, none may differ."""
+    return [
+        f"{name}: {what}"
+        for name, row in differences.items()
+        for what, value in row.items()
+        if not value <= (0.0 if what.startswith("views") else tolerance)
+    ]
 
 
 def main() -> None:
     folder = runtime.given_folder("workdir", "a folder for the results")
-    device, start = jax.devices()[0], time.monotonic()
+    unknown = sorted({*FLAGS.fields} - {*FIELDS})
+    if unknown:
+        raise ConfigError(f"--fields: unknown {unknown}; known: {', '.join(FIELDS)}")
+    device = jax.devices()[0]
     if device.platform == "cpu":
         raise ConfigError(
             "JAX_PLATFORMS: JAX sees no device but the CPU, so there is nothing to compare; "
             "install JAX for the accelerator"
         )
-    found = check_fields(device, jax.devices("cpu")[0])
-    wrong = [
-        f"{name}: {what}"
-        for name, row in found.items()
-        for what, value in row.items()
-        if not value <= (0.0 if what.startswith("views") else FLAGS.tolerance)
-    ]
-    result = {
-        "device": device_name(),
-        "matmul_precision": str(jax.config.jax_default_matmul_precision or "default"),
-        "tolerance": FLAGS.tolerance,
-        "differences": found,
-        "above_tolerance": wrong,
-        "command": runtime.command_line(),
-        "versions": versions(),
-        "total_s": time.monotonic() - start,
-    }
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "check_device.json", result)
-    for name, row in found.items():
-        print(f"{name}: " + ", ".join(f"{what} {value:.1e}" for what, value in row.items()))
-    print(f"numbers: {folder / 'check_device.json'}")
-    if wrong:
-        sys.exit(f"error: {result['device']} differs from the CPU in {'; '.join(wrong)}")
+    path, found = folder / "check_device.json", {}
+    for name in FLAGS.fields or FIELDS:
+        found[name] = check_field(name, device, jax.devices("cpu")[0])
+        print(f"{name}: " + ", ".join(f"{what} {value:.1e}" for what, value in found[name].items()))
+        result = {
+            "device": device_name(),
+            "matmul_precision": str(jax.config.jax_default_matmul_precision or "default"),
+            "tolerance": FLAGS.tolerance,
+            "differences": found,
+            "above_tolerance": too_large(found, FLAGS.tolerance),
+            "command": runtime.command_line(),
+            "versions": versions(),
+        }
+        write_json(path, result)
+    print(f"numbers: {path}")
+    if result["above_tolerance"]:
+        wrong = "; ".join(result["above_tolerance"])
+        sys.exit(f"error: {result['device']} differs from the CPU in {wrong}")
 
 
 if __name__ == "__main__":
