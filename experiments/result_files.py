@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from experiments.bench import results as bench
+from experiments.bench.same_numbers import DEVICE_FILE, differences_table
 from experiments.posthoc.tables import TABLES as POSTHOC_TABLES
 from experiments.predicted.results import RESULT_FILE as GAIN_FILE
 from experiments.predicted.results import correlation_table, stop_table
@@ -50,9 +51,18 @@ def _gain(path: pathlib.Path) -> Collected:
     return Collected(f"{made}: {len(result['cases'])} batches", tables)
 
 
+def _device(path: pathlib.Path) -> Collected:
+    """How far an accelerator's numbers are from the CPU's."""
+    result = read_result(path)
+    made = f"`{result['command']}` ({result['device']}; matrix products at "
+    made += f"{result['matmul_precision']} precision)"
+    return Collected(made, {"differences": differences_table(result["differences"])})
+
+
 FILES: dict[str, Callable[[pathlib.Path], Collected]] = {
     uncertain.NAME: _uncertainty,
     GAIN_FILE: _gain,
+    DEVICE_FILE: _device,
     bench.BENCHMARK: bench.benchmark_tables,
     bench.QUALITY: bench.quality_tables,
     **{name: partial(_posthoc, make) for name, make in POSTHOC_TABLES.items()},

@@ -1,6 +1,7 @@
 """The benchmark: what is counted, what is fitted, and a tiny run from end to end."""
 
 import json
+import pathlib
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from experiments.bench.clock import timed, timed_runs
 from experiments.bench.counts import Work, compiled_work
 from experiments.bench.fits import fit_growth
 from experiments.bench.measure import benchmark
+from experiments.bench.plots import ceiling_plot
 from experiments.bench.results import BENCHMARK, STAGES, amount, benchmark_tables, duration
 from experiments.bench.settings import default_sizes
 from experiments.bench.stages import make_selection_run
@@ -51,6 +53,18 @@ SIZES = {
 }
 
 
+@pytest.fixture
+def measured_without_counts(tmp_path):
+    """The results page's own file, as a GPU would leave it."""
+    path = pathlib.Path("experiments/results/benchmark") / BENCHMARK
+    result = json.loads(path.read_text())
+    for name, stage in result["stages"].items():
+        if name != "train":
+            stage |= {"flops_per_run": 0.0, "flops_per_s": 0.0, "share_of_matmul_ceiling": 0.0}
+    (tmp_path / BENCHMARK).write_text(json.dumps(result))
+    return tmp_path / BENCHMARK
+
+
 # --- counts ----------------------------------------------------------------------------------
 
 
@@ -75,6 +89,29 @@ def test_unrolled_steps_add_up_and_a_loop_counts_once():
     loop = compiled_work(lambda a: jax.lax.fori_loop(0, 3, lambda _, x: x @ a, a), a)
     # The loop's own counter is counted too.
     np.testing.assert_allclose(loop.flops, product.flops, rtol=1e-3)
+
+
+def test_operations_are_counted_without_the_device_that_holds_the_arrays(monkeypatch):
+    """As on a GPU, whose compiler counts none."""
+    devices, original = [], jax.stages.Lowered.cost_analysis
+
+    def watched(self):
+        devices.append(jax.config.jax_default_device)
+        return original(self)
+
+    monkeypatch.setattr(jax.stages.Lowered, "cost_analysis", watched)
+    key, tree = jax.random.key(0), {"x": 1.0}  # a type of its own, and a bare number
+    work = compiled_work(lambda key, tree: jax.random.normal(key, (3,)) + tree["x"], key, tree)
+    assert work.flops > 0 and work.bytes > 0
+    assert devices == [jax.devices("cpu")[0]]
+
+
+def test_stages_without_counts_have_no_share(measured_without_counts):
+    table = collected_text(benchmark_tables(measured_without_counts))
+    assert "operations were not counted on this device" in table
+    assert "0 FLOP" not in table
+    svg = ceiling_plot(json.loads(measured_without_counts.read_text()))
+    assert svg.count("scoring candidates") == 0 and svg.count("training") == 1
 
 
 def test_work_adds_subtracts_and_scales():

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,11 +30,11 @@ def compiled_work(fn: Callable, *args) -> Work:
     """Counts one call of a function by XLA's cost analysis.
 
     XLA counts the body of a loop once, however often it runs, so `fn` should have no loop that
-    matters (a binary search does not). Operations are counted before XLA's optimisation, where
-    matrix products have not yet become calls of a device's own library, which count as nothing;
-    exponentials and the like are not among them. Bytes are counted after it, when steps that are
-    fused no longer pass arrays through memory. They bound the traffic to memory from above: a
-    gather counts its whole table, and caches are not known.
+    matters (a binary search does not). Operations are counted in the program for a CPU, before
+    XLA's optimisation: the programs of other devices call libraries of their own, or cannot be
+    counted at all. Exponentials and the like are not among them. Bytes are counted after it, when
+    steps that are fused no longer pass arrays through memory. They bound the traffic to memory
+    from above: a gather counts its whole table, and caches are not known.
 
     Args:
       fn: a function of arrays; jitted or not.
@@ -42,6 +43,12 @@ def compiled_work(fn: Callable, *args) -> Work:
     Returns:
       `Work` of one call.
     """
-    lowered = jax.jit(fn).lower(*args)
-    before, after = lowered.cost_analysis() or {}, lowered.compile().cost_analysis() or {}
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        before = jax.jit(fn).lower(*_shapes(args)).cost_analysis() or {}
+    after = jax.jit(fn).lower(*args).compile().cost_analysis() or {}
     return Work(before.get("flops", 0.0), after.get("bytes accessed", 0.0))
+
+
+def _shapes(tree):
+    """The same without values, which would bind the program to the device that holds them."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), tree)

@@ -67,7 +67,9 @@ def ceiling_plot(result: dict) -> str:
     figure = Figure(figsize=(6.2, 4.2), layout="constrained")
     axes = figure.add_subplot()
     top, slope = ceilings["matmul_flops_per_s"], ceilings["copy_bytes_per_s"]
-    intensity = {n: s["flops_per_run"] / s["bytes_per_run"] for n, s in stages.items()}
+    # What a device does not let be counted has no place here.
+    counted = {n: s for n, s in stages.items() if s["flops_per_run"] > 0.0}
+    intensity = {n: s["flops_per_run"] / s["bytes_per_run"] for n, s in counted.items()}
     ends = [*intensity.values(), top / slope]
     steps = np.geomspace(min(ends) / 3, max(ends) * 3, 100)
     axes.plot(
@@ -76,8 +78,8 @@ def ceiling_plot(result: dict) -> str:
         linewidth=1.5,
         label="copy, then matrix product",
     )
-    for name, title in STAGES.items():
-        colour, marker = style[name]
+    for name in counted:
+        title, (colour, marker) = STAGES[name], style[name]
         axes.plot(
             *([intensity[name]], [stages[name]["flops_per_s"]]),
             color=colour,

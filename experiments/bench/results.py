@@ -44,10 +44,15 @@ def stage_table(result: dict) -> Table:
             *(title, f"{row[f'{unit}_per_s']:,.0f} {unit}"),
             f"{row[f'{unit}_per_run']:,.0f} in {duration(row['median_run_s'])}",
             duration(row["compile_s"]),
-            *(f"{amount(row['flops_per_s'])}FLOP", f"{row['share_of_matmul_ceiling']:.1%}"),
-            *(f"{amount(row['bytes_per_s'])}B", f"{row['share_of_copy_ceiling']:.1%}"),
         )
-        rows.append(tuple(Cell(text) for text in cells))
+        operations = (f"{amount(row['flops_per_s'])}FLOP", f"{row['share_of_matmul_ceiling']:.1%}")
+        traffic = (f"{amount(row['bytes_per_s'])}B", f"{row['share_of_copy_ceiling']:.1%}")
+        known = [*map(Cell, cells)]
+        if row["flops_per_run"] > 0.0:
+            known += [*map(Cell, operations)]
+        else:
+            known += [dash("operations were not counted on this device")] * 2
+        rows.append((*known, *map(Cell, traffic)))
     return Table(head, tuple(rows))
 
 
