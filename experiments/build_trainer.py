@@ -94,6 +94,7 @@ def build_trainer(
         penalty_weight=train.penalty_weight,
         roughness_weight=train.roughness_weight,
         average_age=train.average_age,
+        capacity_before_hiding=train.look_ahead * capacity,
         steps_per_call=train.steps_per_call,
         mesh=mesh,
     )

@@ -188,6 +188,7 @@ SCHEMA = {
     "train.num_steps": whole(1, 10_000_000),
     "train.num_rays": whole(1, 1 << 20),
     "train.capacity": whole(1, 1 << 24),
+    "train.look_ahead": whole(0, 64),
     "train.learning_rate": number(0.0, 1.0, "what suits the field kind", open_low=True),
     "train.final_share": number(0.0, 1.0, open_low=True),
     "train.warmup_steps": whole(0, 10_000_000),

@@ -67,7 +67,12 @@ def test_a_device_that_computes_something_else_is_found_out(monkeypatch):
 def test_table_of_a_file_names_device_and_precision(tmp_path):
     from experiments.result_files import collect_all
 
-    result = {"schema_version": 1, "command": "made", "device": "a card", "matmul_precision": "highest"}
+    result = {
+        "schema_version": 1,
+        "command": "made",
+        "device": "a card",
+        "matmul_precision": "highest",
+    }
     result |= {"differences": {"hash_grid": {"loss": 1e-7}}}
     (tmp_path / same_numbers.DEVICE_FILE).write_text(json.dumps(result))
     (found,) = collect_all(tmp_path)

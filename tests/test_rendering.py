@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from bavs_jax.cameras import Rays
-from bavs_jax.rendering.compositing import composite, expected_depth, render_weights
+from bavs_jax.rendering.compositing import (
+    composite,
+    expected_depth,
+    render_weights,
+    transmittance,
+)
 from bavs_jax.rendering.hits import nth_hit, pack_hits
 from bavs_jax.rendering.occupancy import (
     WARMUP_UPDATES,
@@ -19,6 +24,7 @@ from bavs_jax.rendering.occupancy import (
 from bavs_jax.rendering.packing import evaluate_all_passes, evaluate_one_pass
 from bavs_jax.rendering.render import Channel, render_rays
 from bavs_jax.rendering.sampling import make_march_options, march
+from bavs_jax.rendering.visible import visible_samples
 from tests.oracles_rendering import march_loop, render_loop, weights_loop
 from tests.toy_fields import rays_through, smooth_field_fn
 
@@ -218,6 +224,87 @@ def test_fresh_occupancy_keeps_everything_at_first():
         jax.random.key(0), occupancy, lambda x: jnp.zeros(len(x)), num_samples=99, step_size=0.1
     )
     assert occupancy.occupied.all()
+
+
+# --- hidden samples --------------------------------------------------------------------------
+
+
+def wall_density(positions):
+    """Thin air before the plane x = 0.2, and a wall of 60 / unit behind it."""
+    return jnp.where(positions[..., 0] > 0.2, 60.0, 0.1)
+
+
+def test_hidden_samples_are_those_that_the_closed_form_says():
+    """Along x: 1.2 units of air, then a wall that light leaves at 1 % after ln(100) / 60 units."""
+    rays = Rays(jnp.array([[-3.0, 0.1, 0.2]]), jnp.array([[1.0, 0.0, 0.0]]))
+    samples = march(rays, init_occupancy(BOX, resolution=4), options(num_steps=400, num_slots=400))
+    least = 0.01 * np.exp(-0.1 * 1.2)
+    kept, fits = visible_samples(wall_density, rays, samples, capacity=400, least=least)
+    assert fits.all() and samples.sample_mask.sum() > 200
+    depth_in_wall = np.log(100.0) / 60.0
+    last = kept.t_mids[0][kept.sample_mask[0]].max()
+    step = samples.deltas[0, 0]
+    np.testing.assert_allclose(last, 3.0 + 0.2 + depth_in_wall, atol=1.5 * step)
+    assert kept.deltas[~kept.sample_mask].sum() == 0.0
+
+
+@pytest.mark.parametrize("least", [0.3, 0.01])
+def test_colours_and_their_gradients_change_by_less_than_the_light_that_is_left(least):
+    rays = rays_through(jax.random.key(7), 60)
+    occupancy = random_occupancy(jax.random.key(8), share=0.8)
+    samples = march(rays, occupancy, options())
+
+    def field_fn(scale, x, d):
+        density, rgb = smooth_field_fn(x, d)
+        return scale * 4.0 * density, rgb
+
+    kept, fits = visible_samples(
+        lambda x: field_fn(1.0, x, x)[0], rays, samples, capacity=4000, least=least
+    )
+    mask, before = np.asarray(kept.sample_mask), np.asarray(samples.sample_mask)
+    assert fits.all() and 0.1 < mask.sum() / before.sum() < 0.95
+    assert (np.diff(mask.astype(int), axis=1) <= 0).all() and not (mask & ~before).any()
+
+    def colours(scale, samples):
+        return render_rays(
+            *(rays, samples, partial(field_fn, scale)), background=WHITE, capacity=4000, exact=False
+        ).rgb
+
+    np.testing.assert_allclose(colours(1.0, kept), colours(1.0, samples), atol=least)
+    for ray in range(0, 60, 6):
+        slope, wanted = (
+            jax.grad(lambda scale, s=s, ray=ray: colours(scale, s)[ray, 0])(1.0)
+            for s in (kept, samples)
+        )
+        # d T / d scale is -tau exp(-tau), with tau = -log(least) where samples end.
+        np.testing.assert_allclose(slope, wanted, atol=2.0 * least * (1.0 - np.log(least)))
+    again, _ = jax.jit(visible_samples, static_argnums=0, static_argnames=("capacity", "least"))(
+        lambda x: field_fn(1.0, x, x)[0], rays, samples, capacity=4000, least=least
+    )
+    np.testing.assert_array_equal(again.sample_mask, mask)
+
+
+def test_rays_that_were_not_looked_at_have_no_samples():
+    rays = rays_through(jax.random.key(7), 60)
+    samples = march(rays, random_occupancy(jax.random.key(8), share=0.8), options())
+    count = np.asarray(samples.sample_mask.sum(-1))
+    capacity = int(count[:20].sum())
+    kept, fits = visible_samples(wall_density, rays, samples, capacity=capacity, least=0.0)
+    np.testing.assert_array_equal(fits, np.cumsum(count) <= capacity)
+    np.testing.assert_array_equal(kept.sample_mask.sum(-1), np.where(fits, count, 0))
+    slope = jax.grad(
+        lambda scale: visible_samples(
+            lambda x: scale * wall_density(x), rays, samples, capacity=capacity, least=0.5
+        )[0].deltas.sum()
+    )(1.0)
+    assert slope == 0.0
+
+
+def test_transmittance_is_what_weights_have_left_over():
+    density = jax.random.exponential(jax.random.key(0), (5, 20)) * 10.0
+    deltas = jax.random.uniform(jax.random.key(1), (5, 20)) * 0.1
+    left = 1.0 - jnp.cumsum(render_weights(density, deltas), axis=-1)
+    np.testing.assert_allclose(transmittance(density, deltas)[:, 1:], left[:, :-1], atol=1e-6)
 
 
 # --- packing ---------------------------------------------------------------------------------

@@ -70,6 +70,14 @@ def trainer():
     return scene, field, sampler, train, fresh
 
 
+def make_train(trainer, optimiser, schedule, *, capacity=1024, **options):
+    """The trainer's training function with other options."""
+    scene, field, sampler, *_ = trainer
+    objective = make_colour_objective(field, capacity=capacity)
+    options = {"num_rays": 64, "background": scene.background, "steps_per_call": 1, **options}
+    return make_train_fn(field, sampler, objective, optimiser, schedule, **options)
+
+
 def test_learning_rate_rises_and_decays():
     options = {"learning_rate": 2e-3, "final_share": 0.01, "num_steps": 1000, "warmup": 100}
     _, schedule = make_optimiser(**options)
@@ -272,16 +280,9 @@ def test_training_learns_and_compiles_once_while_views_are_added(trainer):
 def test_the_penalty_pulls_at_the_field_by_its_weight(trainer):
     scene, field, sampler, *_ = trainer
     table, mask = make_pixel_table(scene), jnp.ones(scene.num_views, bool)
-    objective = make_colour_objective(field, capacity=1024)
     tables = {}
     for weight in (0.0, 3.0):
-        train = make_train_fn(
-            *(field, sampler, objective, optax.sgd(0.5), lambda step: 0.5),
-            num_rays=64,
-            background=scene.background,
-            penalty_weight=weight,
-            steps_per_call=1,
-        )
+        train = make_train(trainer, optax.sgd(0.5), lambda step: 0.5, penalty_weight=weight)
         start = init_train_state(jax.random.key(0), field, sampler, optax.sgd(0.5))
         before = jax.tree.map(lambda x: 1e3 * x, start.params["field"]["encoding"])
         params = start.params | {"field": start.params["field"] | {"encoding": before}}
@@ -319,14 +320,7 @@ def test_roughness_is_the_variation_of_dense_levels_and_counts_by_training_pixel
     table, moved = make_pixel_table(scene), {}
     for weight in (0.0, 500.0):
         for num_views in (2, 5):
-            train = make_train_fn(
-                *(field, sampler, make_colour_objective(field, capacity=1024)),
-                *(optax.sgd(1.0), lambda step: 1.0),
-                num_rays=64,
-                background=scene.background,
-                roughness_weight=weight,
-                steps_per_call=1,
-            )
+            train = make_train(trainer, optax.sgd(1.0), lambda step: 1.0, roughness_weight=weight)
             mask = jnp.arange(scene.num_views) < num_views
             after, _ = train(jax.random.key(1), jax.tree.map(jnp.copy, start), table, mask)
             moved[weight, num_views] = after.params["field"]["encoding"]
@@ -341,18 +335,49 @@ def test_roughness_is_the_variation_of_dense_levels_and_counts_by_training_pixel
 @pytest.mark.parametrize("capacity, num_rays", [(1, 0), (2048, 64)])
 def test_rays_that_did_not_fit_do_not_count_in_the_loss(trainer, capacity, num_rays):
     scene, field, sampler, *_ = trainer
-    objective = make_colour_objective(field, capacity=capacity)
     optimiser, schedule = make_optimiser(learning_rate=1e-2, final_share=0.3, num_steps=64)
-    train = make_train_fn(
-        *(field, sampler, objective, optimiser, schedule),
-        num_rays=64,
-        background=scene.background,
-        steps_per_call=1,
+    train = make_train(trainer, optimiser, schedule, capacity=capacity)
+    start = init_train_state(jax.random.key(0), field, sampler, optimiser)
+    mask = jnp.ones(scene.num_views, bool)
+    _, info = train(jax.random.key(1), start, make_pixel_table(scene), mask)
+    assert info.rays == num_rays and (info.loss > 0.01) == (num_rays > 0)
+
+
+@pytest.mark.parametrize("looked_at, num_rays", [(1, 0), (2048, 64)])
+def test_rays_that_were_not_looked_at_do_not_count_in_the_loss(trainer, looked_at, num_rays):
+    scene, field, sampler, *_ = trainer
+    optimiser, schedule = make_optimiser(learning_rate=1e-2, final_share=0.3, num_steps=64)
+    train = make_train(
+        trainer, optimiser, schedule, capacity=2048, capacity_before_hiding=looked_at
     )
     start = init_train_state(jax.random.key(0), field, sampler, optimiser)
     mask = jnp.ones(scene.num_views, bool)
     _, info = train(jax.random.key(1), start, make_pixel_table(scene), mask)
     assert info.rays == num_rays and (info.loss > 0.01) == (num_rays > 0)
+
+
+def test_leaving_out_hidden_samples_trains_the_same_with_fewer_of_them(trainer):
+    scene, _, sampler, *_ = trainer
+    thick = make_hash_grid_field(
+        scene.box, num_levels=1, finest=8, width=16, initial_optical_depth=20.0
+    )
+    table, mask = make_pixel_table(scene), jnp.ones(scene.num_views, bool)
+    start = init_train_state(jax.random.key(0), thick, sampler, optax.sgd(1.0))
+    found = {}
+    for looked_at in (0, 2048):
+        train = make_train(
+            *((scene, thick, sampler), optax.sgd(1.0), lambda step: 1.0),
+            capacity=2048,
+            capacity_before_hiding=looked_at,
+        )
+        state, info = train(jax.random.key(1), jax.tree.map(jnp.copy, start), table, mask)
+        found[looked_at] = state.params["field"], info
+    (params, info), (wanted, whole) = found[2048], found[0]
+    assert info.rays == whole.rays == 64 and info.samples < 0.5 * whole.samples
+    np.testing.assert_allclose(info.loss, whole.loss, rtol=1e-2)
+    moved, wanted = (jax.tree.map(jnp.subtract, p, start.params["field"]) for p in (params, wanted))
+    off = optax.global_norm(jax.tree.map(jnp.subtract, moved, wanted))
+    assert off < 0.1 * optax.global_norm(wanted)
 
 
 def test_training_is_deterministic(trainer):

@@ -19,10 +19,20 @@ def exclusive_cumsum(x: jax.Array) -> jax.Array:
     return jnp.matmul(x, earlier, precision=jax.lax.Precision.HIGHEST)
 
 
+def transmittance(density: jax.Array, deltas: jax.Array) -> jax.Array:
+    """Light that reaches each sample (Eq 3): `T_i = exp(-sum_{j<i} sigma_j delta_j)`, [..., S].
+
+    Args:
+      density: [..., S] >= 0, 1 / scene unit.
+      deltas: [..., S] >= 0, scene units.
+    """
+    return jnp.exp(-exclusive_cumsum(density * deltas))
+
+
 def render_weights(density: jax.Array, deltas: jax.Array) -> jax.Array:
     """Share of the pixel that each sample makes up (Eq 3): `w_i = T_i (1 - exp(-sigma_i delta_i))`.
 
-    `T_i = exp(-sum_{j<i} sigma_j delta_j)` is the light that reaches sample i.
+    T is the `transmittance`.
 
     Args:
       density: [..., S] >= 0, 1 / scene unit.
@@ -33,9 +43,7 @@ def render_weights(density: jax.Array, deltas: jax.Array) -> jax.Array:
 
     Numerics: `-expm1(-x)` keeps small opacities exact.
     """
-    optical = density * deltas
-    trans = jnp.exp(-exclusive_cumsum(optical))
-    return trans * -jnp.expm1(-optical)
+    return transmittance(density, deltas) * -jnp.expm1(-density * deltas)
 
 
 def composite(weights: jax.Array, values: jax.Array, background) -> jax.Array:

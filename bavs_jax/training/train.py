@@ -12,11 +12,14 @@ import optax
 from flax import struct
 from jax.sharding import Mesh
 
-from bavs_jax.devices import gather_rays, spread_rays
+from bavs_jax.devices import gather_rays, over_rays, spread_rays
 from bavs_jax.fields.base import Field
 from bavs_jax.rendering.samplers import Sampler
+from bavs_jax.rendering.visible import visible_samples
 from bavs_jax.training.batches import sample_pixels
 from bavs_jax.training.losses import colour_loss
+
+LEAST_LIGHT = 0.01  # that must reach a sample for it to be trained
 
 
 @struct.dataclass
@@ -121,6 +124,7 @@ def make_train_fn(
     penalty_weight: float = 0.0,
     roughness_weight: float = 0.0,
     average_age: float = 0.0,
+    capacity_before_hiding: int = 0,
     steps_per_call: int = 16,
     mesh: Mesh | None = None,
 ) -> Callable:
@@ -138,6 +142,8 @@ def make_train_fn(
         counts the less the more pixels there are.
       average_age: mean age of the parameters that are rendered, as a share of the steps done
         (see `average_weight`); 0 renders the last ones.
+      capacity_before_hiding: samples on each device whose density is looked at in a step, to leave
+        out those that are hidden behind others (see `visible_samples`); 0 leaves out none.
       steps_per_call: optimiser steps compiled together.
       mesh: devices that share the rays (see `devices.py`); the objective must have the same.
 
@@ -145,6 +151,17 @@ def make_train_fn(
       `train(key, state, table, is_training_view) -> (state, TrainInfo)`: `steps_per_call` steps in
       one jitted call. Views are a mask, so adding views compiles nothing anew. `state` is donated.
     """
+
+    def see(params, rays, samples):
+        return visible_samples(
+            partial(field.density, params),
+            rays,
+            samples,
+            capacity=capacity_before_hiding,
+            least=LEAST_LIGHT,
+        )
+
+    visible = over_rays(see, mesh, spread=(False, True, True))
 
     def loss_fn(params, key, sampler_state, table, is_training_view):
         pixel_key, sample_key, objective_key = jax.random.split(key, 3)
@@ -155,13 +172,17 @@ def make_train_fn(
         )
         batch = spread_rays(batch, mesh)
         samples, aux = sampler.sample(sample_key, params["sampler"], sampler_state, batch.rays)
+        fits = jnp.ones(num_rays, bool)
+        if capacity_before_hiding and not sampler.dense:
+            samples, fits = visible(params["field"], batch.rays, samples)
+            batch = batch.replace(ray_weight=batch.ray_weight * fits)
         outcome = objective(objective_key, params["field"], batch, samples)
         ray_weight = batch.ray_weight * outcome.ray_mask
         colour_loss_fn = partial(colour_loss, target=batch.rgb, ray_weight=ray_weight)
         sampler_loss = sampler.loss(aux, samples, outcome.weights, colour_loss_fn)
         report = {
             "loss": colour_loss_fn(outcome.rgb),
-            "rays": outcome.ray_mask.sum(),
+            "rays": (outcome.ray_mask & fits).sum(),
             "samples": (samples.sample_mask & outcome.ray_mask[:, None]).sum(),
             "thinned": samples.thinned.mean(),
         }

@@ -109,9 +109,10 @@ def get_config() -> ConfigDict:
 
     # --- training (training/train.py) ---
     config.train = ConfigDict()
-    config.train.num_steps = 3200  # optimiser steps of each round
-    config.train.num_rays = 1024
+    config.train.num_steps = 4000  # optimiser steps of each round
+    config.train.num_rays = 2048  # of one step; those that do not fit into it are left out
     config.train.capacity = 8192  # samples evaluated in one step
+    config.train.look_ahead = 2  # times as many are looked at, to leave out hidden ones; 0: never
     config.train.random_background = True  # for each ray, where photos have alpha
     config.train.learning_rate = 0.0  # 0: what suits the field kind
     config.train.final_share = 0.1  # of the learning rate, at the end of a round

@@ -17,6 +17,7 @@ def get_config():
     config.num_rounds = 0
     config.field.finest = 512
     config.field.appearance_features = 4
+    config.train.num_rays = 1024  # each with all of its samples
     config.train.num_steps = 4000
     config.uncertainty.max_rays = 100_000
     return config
