@@ -308,7 +308,11 @@ def test_a_page_names_its_rows(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "page", ["README.md", "experiments/results/README.md", "experiments/results/TRIES.md"]
+    "page",
+    [
+        "README.md",
+        *(f"experiments/results/{n}.md" for n in ("README", "POLICIES", "PAPER", "TRIES")),
+    ],
 )
 def test_pages_show_what_the_result_files_say(page):
     path = ROOT / page
