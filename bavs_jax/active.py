@@ -20,7 +20,7 @@ from bavs_jax.selection.batch import SelectionInfo, acquire
 from bavs_jax.selection.context import make_context
 from bavs_jax.selection.policy import Policy
 from bavs_jax.training.batches import PixelTable
-from bavs_jax.training.health import MAX_RESTARTS, colour_spread, is_stuck
+from bavs_jax.training.fit import fit
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import Situation
 
@@ -115,8 +115,7 @@ def make_active_step(
       centre: [3] scene centre, scene units.
       batch_size: views chosen at once.
       calls_per_round: compiled training calls of a round.
-      check_call: after how many of them a field that is stuck begins anew with another key, at
-        most `health.MAX_RESTARTS` times in a round; None: never.
+      check_call: see `fit`.
       num_rays: R of Eq 13, the training rays of round 0.
       radii: of the max-min distance filter; by default from the cameras.
       mode: "top_k" or "greedy"; by default the policy's own.
@@ -166,50 +165,36 @@ def make_active_step(
     def step(key, state, on_choice=None, on_call=None):
         choice = None
         if int(state.calls) >= calls_per_round:
-            choose_key, restart_key, _ = _round_keys(key, int(state.round) + 1)
+            choose_key, restart_key, _ = round_keys(key, int(state.round) + 1)
             state, choice = choose(choose_key, state)
             state = state.replace(train=stages.restart(restart_key, state.train))
             if on_choice is not None:
                 on_choice(state, choice)
 
-        _, _, train_key = _round_keys(key, int(state.round))
+        _, _, train_key = round_keys(key, int(state.round))
         start = time.perf_counter()
-        while (call := int(state.calls)) < calls_per_round:
-            train, train_info = stages.train_call(
-                _call_key(train_key, int(state.restarts), call),
-                state.train,
-                state.table,
-                state.is_training_view,
+        for fitted in fit(
+            *(train_key, stages.init, stages.train_call),
+            *(state.train, state.table, state.is_training_view),
+            num_calls=calls_per_round,
+            check_call=check_call,
+            calls=int(state.calls),
+            restarts=int(state.restarts),
+            label=f"round {int(state.round)}",
+        ):
+            state = state.replace(
+                train=fitted.train,
+                calls=jnp.int32(fitted.calls),
+                restarts=jnp.int32(fitted.restarts),
             )
-            if not np.isfinite(train_info.loss):
-                raise FloatingPointError(
-                    f"round {int(state.round)}, training call {call}: the loss is "
-                    f"{float(train_info.loss)}; try a smaller learning rate"
-                )
-            state = state.replace(train=train, calls=jnp.int32(call + 1))
-            if call + 1 == check_call and int(state.restarts) < MAX_RESTARTS:
-                spread = colour_spread(state.table, state.is_training_view)
-                if is_stuck(train_info, spread):
-                    restarts = int(state.restarts) + 1
-                    state = state.replace(
-                        train=stages.init(_call_key(train_key, restarts, calls_per_round)),
-                        calls=jnp.int32(0),
-                        restarts=jnp.int32(restarts),
-                    )
             if on_call is not None:
-                on_call(state, train_info)
+                on_call(state, fitted.info)
         jax.block_until_ready(state.train.step)
         return state, RoundInfo(int(state.round), choice, time.perf_counter() - start)
 
     return step
 
 
-def _call_key(train_key, restarts: int, call: int):
-    """Of one compiled call; a round that begins anew draws other pixels."""
-    key = train_key if restarts == 0 else jax.random.fold_in(train_key, 2**31 - 1 - restarts)
-    return jax.random.fold_in(key, call)
-
-
-def _round_keys(key, number: int):
-    """Keys of a round for choosing, restarting and training."""
+def round_keys(key, number: int):
+    """Keys of a round for choosing, restarting and training; round 0 is trained by the last."""
     return jax.random.split(jax.random.fold_in(key, number), 3)

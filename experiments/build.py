@@ -46,6 +46,7 @@ class Problem(NamedTuple):
     kind: str  # of the field that is trained and measured
     table: PixelTable
     init_train: Callable  # key -> TrainState
+    train_call: Callable  # see `make_train_fn`
     make_step: Callable  # (policy name, initial views, track, label) -> an active step
     render: Callable  # (TrainState, jac_sq_sum or None, num_rays) -> (Rays [chunk] -> dict)
     density: Callable  # (TrainState, positions [K, 3]) -> density [K], 0 where nothing is rendered
@@ -218,6 +219,7 @@ def build_problem(
         kind=kind,
         table=table,
         init_train=trainer.init,
+        train_call=trainer.call,
         make_step=make_step,
         render=render,
         density=density,

@@ -7,7 +7,6 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
-import numpy as np
 from jax.sharding import Mesh
 
 from bavs_jax.devices import num_shards, put_on_all
@@ -15,7 +14,8 @@ from bavs_jax.fields.base import Field
 from bavs_jax.fields.flow_field import FlowField, mean_field
 from bavs_jax.rendering.samplers import Sampler
 from bavs_jax.scenes import Scene
-from bavs_jax.training.health import MAX_RESTARTS, check_call, colour_spread, is_stuck
+from bavs_jax.training.fit import fit
+from bavs_jax.training.health import check_call
 from bavs_jax.training.objectives import (
     make_colour_objective,
     make_flow_objective,
@@ -120,31 +120,21 @@ def train_aside(
       FloatingPointError: the loss is not finite.
     """
     num_calls, steps = calls_per_round(config), config.train.steps_per_call
-    check = check_call(num_calls, steps)
+    init_key, steps_key = jax.random.split(jax.random.fold_in(key, 0))
+    state = trainer.init(init_key)
     with track(num_calls * steps, f"{situation.label}: train {kind}", "steps") as bar:
-        for attempt in range(MAX_RESTARTS + 1):
-            init_key, steps_key = jax.random.split(jax.random.fold_in(key, attempt))
-            state = trainer.init(init_key)
-            for number in range(num_calls):
-                state, info = trainer.call(
-                    jax.random.fold_in(steps_key, number),
-                    state,
-                    situation.table,
-                    situation.is_training_view,
+        for fitted in fit(
+            *(steps_key, trainer.init, trainer.call),
+            *(state, situation.table, situation.is_training_view),
+            num_calls=num_calls,
+            check_call=check_call(num_calls, steps),
+            label=f"{kind} field",
+        ):
+            state = fitted.train
+            bar.advance(steps, loss=float(fitted.info.loss))
+            if fitted.calls == 0:
+                warn(
+                    f"{situation.label}: the {kind} field is stuck: trained anew with another key "
+                    f"({fitted.restarts})"
                 )
-                if not np.isfinite(info.loss):
-                    raise FloatingPointError(
-                        f"{kind} field, training call {number}: the loss is {float(info.loss)}; "
-                        "try a smaller learning rate"
-                    )
-                bar.advance(steps, loss=float(info.loss))
-                if number + 1 == check and attempt < MAX_RESTARTS:
-                    spread = colour_spread(situation.table, situation.is_training_view)
-                    if is_stuck(info, spread):
-                        warn(
-                            f"{situation.label}: the {kind} field is stuck: trained anew with "
-                            f"another key ({attempt + 1})"
-                        )
-                        break
-            else:
-                return state
+    return state

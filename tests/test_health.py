@@ -1,5 +1,6 @@
 """Fields that learn nothing begin anew, a stated number of times, and are never told as results."""
 
+import itertools
 from types import SimpleNamespace
 
 import jax
@@ -11,6 +12,7 @@ from bavs_jax import active
 from bavs_jax.candidates import dataset_candidates
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.training.batches import make_pixel_table
+from bavs_jax.training.fit import fit
 from bavs_jax.training.health import MAX_RESTARTS, check_call, colour_spread, is_stuck
 from bavs_jax.training.train import TrainInfo, TrainState
 from bavs_jax.uncertainty.model import Situation
@@ -58,19 +60,25 @@ def test_short_rounds_are_not_looked_at():
     assert check_call(31, 16) is None
 
 
-def make_step(losses, scene):
-    """A step whose training calls only report; `losses[a]` is what attempt a reports."""
+def make_calls(losses):
+    """`init` and `call` that only report, `losses[a]` for attempt a, and which keys they got."""
     inits, keys = [], []
 
     def init(key):
         inits.append(jax.random.key_data(key).tolist())
         return fresh(len(inits))
 
-    def train_call(key, train, table, is_training_view):
+    def call(key, train, table, is_training_view):
         keys.append(jax.random.key_data(key).tolist())
         return train.replace(step=train.step + 1), report(losses[int(train.params)])
 
-    stages = active.Stages(train_call, init, lambda key, train: train, None)
+    return init, call, inits, keys
+
+
+def make_step(losses, scene):
+    """A step whose training calls only report."""
+    init, call, inits, keys = make_calls(losses)
+    stages = active.Stages(call, init, lambda key, train: train, None)
     step = active.make_active_step(
         get_policy("random"),
         stages,
@@ -131,59 +139,81 @@ class KilledError(Exception):
     pass
 
 
+LONG = {"train__num_steps": 1024, "train__steps_per_call": 128}  # looked at after 2 of 8 calls
+
+
 def test_a_capture_whose_field_was_stuck_goes_on_with_its_count_after_a_kill(tmp_path, capsys):
     """The second attempt is cut off; started again, it ends as if it had not been."""
-    scene = toy_scene(num_views=4, num_test=1)
-    config = toy_config(train__steps_per_call=1)
-    ends, keys = {}, {}
-    for name, last in (("whole", None), ("cut", CHECK + 2)):
-        step, _, keys[name] = make_step([1.0, 0.001], scene)
+    scene, config, ends = toy_scene(num_views=4, num_test=1), toy_config(**LONG), {}
+    for name, last in (("whole", None), ("cut", 5)):
+        init, call, _, keys = make_calls([1.0, 0.001])
 
-        def cut_step(key, state, on_choice, on_call, step=step, last=last, keys=keys[name]):
-            def counted(state, info):
-                on_call(state, info)
-                if len(keys) == last:
-                    raise KilledError
+        def cut_call(*args, call=call, last=last, keys=keys):
+            if len(keys) == last:
+                keys.append(None)
+                raise KilledError
+            return call(*args)
 
-            return step(key, state, on_choice, counted)
+        attempts = itertools.count()
+
+        def init_train(key, attempts=attempts, init=init):
+            return init(key) if next(attempts) else fresh(0)
 
         problem = SimpleNamespace(
             scene=scene,
             table=make_pixel_table(scene),
-            init_train=lambda key: fresh(0),
-            calls_per_round=CALLS,
-            make_step=lambda *args, cut_step=cut_step: cut_step,
+            init_train=init_train,
+            train_call=cut_call,
+            calls_per_round=8,
         )
         if last:
             with pytest.raises(KilledError):
                 train_field(config, problem, tmp_path / name, seed=0)
-        ends[name] = train_field(config, problem, tmp_path / name, seed=0)
-    assert keys["cut"] == keys["whole"] and len(keys["whole"]) == CHECK + CALLS
-    assert [int(end.params) for end in ends.values()] == [1, 1]
+        state = train_field(config, problem, tmp_path / name, seed=0)
+        ends[name] = state, [key for key in keys if key]
+    (whole, whole_keys), (cut, cut_keys) = ends["whole"], ends["cut"]
+    assert cut_keys == whole_keys and len(whole_keys) == 2 + 8
+    assert int(cut.params) == int(whole.params) == 1
     assert "the field is stuck: trained anew with another key (1)" in capsys.readouterr().err
 
 
 def test_a_field_trained_aside_begins_anew_and_says_so(capsys):
-    scene, losses, keys, inits = toy_scene(num_views=4, num_test=1), [1.0, 0.001], [], []
-    config = toy_config(train__num_steps=1024, train__steps_per_call=128)  # looked at after 2 of 8
-
-    def init(key):
-        inits.append(key)
-        return fresh(len(inits) - 1)
-
-    def call(key, train, table, is_training_view):
-        keys.append(jax.random.key_data(key).tolist())
-        return train.replace(step=train.step + 1), report(losses[int(train.params)])
-
+    scene = toy_scene(num_views=4, num_test=1)
+    init, call, inits, keys = make_calls([9.0, 1.0, 0.001])  # the first `init` is no restart
     is_training = np.array([True, True, False, False, False])
     situation = Situation(fresh(0), make_pixel_table(scene), is_training, 0, label="toy")
     trainer = Trainer(None, None, init, call, None)
-    state = train_aside(config, trainer, jax.random.key(0), situation, "variance", track)
-    assert int(state.params) == 1 and int(state.step) == 8 and len(keys) == 2 + 8
-    assert len({tuple(key) for key in keys}) == 10
+    state = train_aside(
+        toy_config(**LONG), trainer, jax.random.key(0), situation, "variance", track
+    )
+    assert int(state.params) == 2 and int(state.step) == 8 and len(keys) == 2 + 8
+    assert len({tuple(key) for key in keys}) == 10 and len(inits) == 2
     assert "toy: the variance field is stuck: trained anew with another key (1)" in (
         capsys.readouterr().err
     )
+
+
+def test_training_that_is_picked_up_goes_the_same_way_and_a_bad_loss_ends_it():
+    scene = toy_scene(num_views=4, num_test=1)
+    where = (make_pixel_table(scene), np.array([True, True, False, False]))
+
+    def trained(losses, **begin):
+        init, call, _, keys = make_calls(losses)
+        parts = fit(
+            *(jax.random.key(3), init, call, fresh(begin.get("restarts", 0)), *where),
+            num_calls=CALLS,
+            check_call=CHECK,
+            label="toy",
+            **begin,
+        )
+        return [*parts], keys
+
+    whole, keys = trained([1.0, 0.001])
+    assert [(f.calls, f.restarts) for f in whole[CHECK - 1 :]] == [(n, 1) for n in range(CALLS + 1)]
+    _, rest = trained([1.0, 0.001], calls=2, restarts=1)
+    assert rest == keys[-len(rest) :] and len(rest) == CALLS - 2
+    with pytest.raises(FloatingPointError, match="toy, training call 0: the loss is nan; try"):
+        trained([float("nan")])
 
 
 def test_a_table_marks_policies_with_a_stuck_field(tmp_path):

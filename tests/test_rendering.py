@@ -284,6 +284,15 @@ def test_colours_and_their_gradients_change_by_less_than_the_light_that_is_left(
     np.testing.assert_array_equal(again.sample_mask, mask)
 
 
+def test_what_is_not_a_number_is_not_hidden():
+    rays = rays_through(jax.random.key(7), 3)
+    samples = march(rays, init_occupancy(BOX, resolution=4), options())
+    kept, _ = visible_samples(
+        lambda x: jnp.full(len(x), jnp.nan), rays, samples, capacity=200, least=0.01
+    )
+    np.testing.assert_array_equal(kept.sample_mask, samples.sample_mask)
+
+
 def test_rays_that_were_not_looked_at_have_no_samples():
     rays = rays_through(jax.random.key(7), 60)
     samples = march(rays, random_occupancy(jax.random.key(8), share=0.8), options())

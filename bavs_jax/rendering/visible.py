@@ -42,7 +42,8 @@ def visible_samples(
 
     found, ray_mask = evaluate_one_pass(density, samples.sample_mask, capacity=capacity)
     # Light only ever fades along a ray, so what is seen of a row still comes first.
-    seen = transmittance(found, samples.deltas) >= least
+    # What is not a number is seen too, and shows in the loss.
+    seen = ~(transmittance(found, samples.deltas) < least)
     mask = samples.sample_mask & seen & ray_mask[:, None]
     samples = samples.replace(sample_mask=mask, deltas=jnp.where(mask, samples.deltas, 0.0))
     return jax.lax.stop_gradient((samples, ray_mask))

@@ -8,7 +8,9 @@ import time
 import jax
 import numpy as np
 
-from bavs_jax.active import init_active_state
+from bavs_jax.active import init_active_state, round_keys
+from bavs_jax.training.fit import fit
+from bavs_jax.training.health import check_call
 from experiments import runtime
 from experiments.bench.subject import SEED
 from experiments.build import build_problem
@@ -57,26 +59,29 @@ def measure_run(config, *, num_views: int, num_test_views: int, every: int, star
     view_ids = spread_evenly(scene.test, num_test_views)
     steps, key = config.train.steps_per_call, run_key(SEED)
     calls_between = -(-every // steps)
-    step = problem.make_step("random", initial, track, "train")
+    train = problem.init_train(stream_key(SEED, "init"))
+    is_training = init_active_state(train, problem.table, initial).is_training_view
+    num_calls = problem.calls_per_round
+    *_, train_key = round_keys(key, 0)
     paused, curve = 0.0, []
 
-    with track(problem.calls_per_round * steps, f"train on {num_views} views", "steps") as bar:
-
-        def on_call(state, info):
-            nonlocal paused
-            calls = int(state.calls)
-            is_last = calls == problem.calls_per_round
-            if calls % calls_between == 0 or is_last:
-                jax.block_until_ready(state.train)
+    with track(num_calls * steps, f"train on {num_views} views", "steps") as bar:
+        for fitted in fit(
+            *(train_key, problem.init_train, problem.train_call),
+            *(train, problem.table, is_training),
+            num_calls=num_calls,
+            check_call=check_call(num_calls, steps),
+            label="train",
+        ):
+            if fitted.calls % calls_between == 0 or fitted.calls == num_calls:
+                jax.block_until_ready(fitted.train)
                 stopped = time.time()
-                measures = evaluate_views(problem.render(state.train), scene, view_ids)
+                measures = evaluate_views(problem.render(fitted.train), scene, view_ids)
                 seconds = stopped - started - paused
-                curve.append({"step": calls * steps, "seconds": seconds, "psnr": measures["psnr"]})
+                step = fitted.calls * steps
+                curve.append({"step": step, "seconds": seconds, "psnr": measures["psnr"]})
                 paused += time.time() - stopped
             bar.advance(steps, psnr=curve[-1]["psnr"] if curve else np.nan)
-
-        fresh = problem.init_train(stream_key(SEED, "init"))
-        step(key, init_active_state(fresh, problem.table, initial), None, on_call)
     return {
         "curve": curve,
         "scene": scene.name,

@@ -9,9 +9,11 @@ import time
 import jax.numpy as jnp
 import numpy as np
 
-from bavs_jax.active import init_active_state
+from bavs_jax.active import init_active_state, round_keys
 from bavs_jax.scenes import Scene, SceneError
 from bavs_jax.training.checkpoints import Checkpoints
+from bavs_jax.training.fit import fit
+from bavs_jax.training.health import check_call
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import Situation
 from bavs_jax.uncertainty.models.laplace import training_curvature
@@ -44,36 +46,37 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
     """
     pool, steps = problem.scene.pool, config.train.steps_per_call
     checkpoints = Checkpoints(folder / "checkpoints", warn_fn=warn)
-    init_key = stream_key(seed, "init")
-    state = init_active_state(problem.init_train(init_key), problem.table, pool)
-    found = checkpoints.restore(state.train)
-    if found is not None:
-        saved, meta = found
-        state = state.replace(
-            train=saved, calls=jnp.int32(meta["calls"]), restarts=jnp.int32(meta["restarts"])
-        )
-    left = problem.calls_per_round - int(state.calls)
-    if left > 0:
+    train, calls, restarts = problem.init_train(stream_key(seed, "init")), 0, 0
+    if (found := checkpoints.restore(train)) is not None:
+        train, meta = found
+        calls, restarts = meta["calls"], meta["restarts"]
+    num_calls = problem.calls_per_round
+    if calls < num_calls:
         saved_at = time.monotonic()
-        with track(left * steps, f"train on {len(pool)} photos", "steps") as bar:
-
-            def on_call(state, info):
-                nonlocal saved_at
+        is_training = init_active_state(train, problem.table, pool).is_training_view
+        *_, key = round_keys(run_key(seed), 0)
+        with track((num_calls - calls) * steps, f"train on {len(pool)} photos", "steps") as bar:
+            for fitted in fit(
+                *(key, problem.init_train, problem.train_call),
+                *(train, problem.table, is_training),
+                num_calls=num_calls,
+                check_call=check_call(num_calls, steps),
+                calls=calls,
+                restarts=restarts,
+                label="photos",
+            ):
+                train, calls, restarts, info = fitted
                 loss = float(info.loss)
                 bar.advance(steps, loss=loss, psnr=-10.0 * np.log10(loss))
-                calls, restarts = int(state.calls), int(state.restarts)
                 if calls == 0:
                     warn(f"the field is stuck: trained anew with another key ({restarts})")
                 due = time.monotonic() - saved_at > config.checkpoint_seconds
-                if due or calls == problem.calls_per_round:
-                    number = restarts * (problem.calls_per_round + 1) + calls
-                    checkpoints.save(number, state.train, {"calls": calls, "restarts": restarts})
+                if due or calls == num_calls:
+                    number = restarts * (num_calls + 1) + calls
+                    checkpoints.save(number, train, {"calls": calls, "restarts": restarts})
                     saved_at = time.monotonic()
-
-            step = problem.make_step("bavs", pool, track, "suggest")
-            state, _ = step(run_key(seed), state, None, on_call)
     checkpoints.close()
-    return state.train
+    return train
 
 
 def photo_curvature(problem: Problem, train: TrainState, folder: pathlib.Path, seed: int):
