@@ -1,4 +1,4 @@
-"""Tables that fill themselves: every module of a package holds one entry."""
+"""Tables that fill themselves from the modules of a package."""
 
 from __future__ import annotations
 
@@ -6,26 +6,27 @@ import importlib
 import pkgutil
 
 
-def collect(package: str, path, attribute: str, kind: str) -> dict:
-    """Imports every module of a package and collects one attribute of each, by module name.
+def collect(package: str, path, attribute: str, kind: type) -> dict:
+    """Imports every module of a package and collects what each holds, sorted by name.
 
     Args:
       package: its full name.
       path: its `__path__`.
-      attribute: what every module must hold, an object whose `name` is the module's.
-      kind: its type, for messages.
+      attribute: what every module must hold: a tuple of objects with a `name`.
+      kind: their type.
 
     Raises:
-      ValueError: a module without it, or with another name in it.
+      ValueError: a module without it, or two objects of one name.
     """
-    table = {}
+    table, folder = {}, package.rsplit(".", 1)[-1]
     for module_info in pkgutil.iter_modules(path):
-        name = module_info.name
-        entry = getattr(importlib.import_module(f"{package}.{name}"), attribute, None)
-        if entry is None or entry.name != name:
-            folder = package.rsplit(".", 1)[-1]
-            raise ValueError(
-                f"{folder}/{name}.py: must hold {attribute} = {kind}(name={name!r}, ...)"
-            )
-        table[name] = entry
-    return table
+        file = f"{folder}/{module_info.name}.py"
+        entries = getattr(importlib.import_module(f"{package}.{module_info.name}"), attribute, None)
+        is_tuple = type(entries) is tuple and entries
+        if not is_tuple or not all(isinstance(entry, kind) for entry in entries):
+            raise ValueError(f"{file}: must hold {attribute} = ({kind.__name__}(name=..., ...),)")
+        for entry in entries:
+            if entry.name in table:
+                raise ValueError(f"{file}: the name {entry.name!r} is taken; give it another")
+            table[entry.name] = entry
+    return dict(sorted(table.items()))

@@ -22,7 +22,7 @@ from bavs_jax.rendering import compositing, histograms, sampling
 from bavs_jax.scenes import procedural, sculpture, sdf, sdf_surface
 from bavs_jax.selection.directional import same_side
 from bavs_jax.selection.distances import pairwise_distances
-from bavs_jax.selection.policies.farthest_arc import great_circle
+from bavs_jax.selection.policies.distance import great_circle
 from bavs_jax.training.batches import view_pixel_rays
 from bavs_jax.uncertainty import active_gain, coverage, curvature, entropy, visibility, warp
 

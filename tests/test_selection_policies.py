@@ -1,6 +1,7 @@
 """One battery that every policy of the table passes, then what is special to each."""
 
 import itertools
+from functools import partial
 
 import jax
 import numpy as np
@@ -13,7 +14,7 @@ from bavs_jax.selection.directional import DirectionalInformation, Look, make_pr
 from bavs_jax.selection.distances import pairwise_distances
 from bavs_jax.selection.information import Information, make_cached_curvature_fn, sparse_curvature
 from bavs_jax.selection.policies import POLICIES, get_policy
-from bavs_jax.selection.policies.farthest import make_farthest
+from bavs_jax.selection.policies.distance import farthest_score
 from bavs_jax.selection.policy import MODES
 from tests import oracles_selection as oracles
 
@@ -279,7 +280,8 @@ def test_farthest_takes_another_distance():
         centre=[1.0, 0.0, 0.0],
     )
     straight, _ = acquire(POLICIES["farthest"], KEY, ctx, 1)
-    bent, _ = acquire(make_farthest(summary="Arc.", distance=great_circle), KEY, ctx, 1)
+    arc = POLICIES["farthest"]._replace(score_fn=partial(farthest_score, distance=great_circle))
+    bent, _ = acquire(arc, KEY, ctx, 1)
     assert (straight.tolist(), bent.tolist()) == ([0], [1])
 
 
@@ -380,7 +382,7 @@ def test_unknown_policy_names_the_nearest_and_all():
 def test_a_new_file_registers_itself(tmp_path, monkeypatch):
     (tmp_path / "first_id.py").write_text(
         "from bavs_jax.selection.policy import Policy\n"
-        "POLICY = Policy('first_id', 'Smallest id.', lambda key, ctx: -ctx.view_ids)\n"
+        "POLICIES = (Policy('first_id', 'Smallest id.', lambda key, ctx: -ctx.view_ids),)\n"
     )
     monkeypatch.setattr(policies, "__path__", [*policies.__path__, str(tmp_path)])
     table = policies.collect_policies()
@@ -390,10 +392,18 @@ def test_a_new_file_registers_itself(tmp_path, monkeypatch):
     np.testing.assert_array_equal(ctx.view_ids[selected], np.sort(ctx.view_ids[ctx.mask])[:3])
 
 
-@pytest.mark.parametrize("text", ["", "POLICY = None\n"])
-def test_a_file_without_its_policy_is_an_error(tmp_path, monkeypatch, text):
-    name = f"empty_{len(text)}"  # imported modules are remembered by name
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("", r"must hold POLICIES = \(Policy\(name=..., ...\),\)"),
+        ("POLICIES = ()\n", "must hold POLICIES"),
+        ("POLICIES = ('bavs',)\n", "must hold POLICIES"),
+        ("from bavs_jax.selection.policies.distance import POLICIES\n", "'farthest' is taken"),
+    ],
+)
+def test_a_file_without_policies_of_its_own_is_an_error(tmp_path, monkeypatch, text, message):
+    name = f"wrong_{len(text)}"  # imported modules are remembered by name
     (tmp_path / f"{name}.py").write_text(text)
     monkeypatch.setattr(policies, "__path__", [*policies.__path__, str(tmp_path)])
-    with pytest.raises(SelectionError, match=rf"policies/{name}.py: must hold POLICY"):
+    with pytest.raises(SelectionError, match=rf"policies/{name}.py: .*{message}"):
         policies.collect_policies()

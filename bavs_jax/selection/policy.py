@@ -25,7 +25,7 @@ class Policy(NamedTuple):
     given the context before the first pick; None where nothing is known.
     """
 
-    name: str  # also the name of its file
+    name: str  # by which a config names it
     summary: str  # one sentence
     score_fn: Callable[[jax.Array, Context], jax.Array]
     update_fn: Callable[[Context, int], Context] | None = None

@@ -30,7 +30,7 @@ class UncertaintyModel(NamedTuple):
     background is known must not decide.
     """
 
-    name: str  # also the name of its file
+    name: str  # by which a config names it
     summary: str  # one sentence
     make_fns: Callable[[Toolbox], ModelFns]
     trains: tuple[str, ...] = ()  # kinds of fields that it trains beside the reconstruction

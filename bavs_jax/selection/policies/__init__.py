@@ -1,7 +1,7 @@
-"""The table of policies: every module here holds one `POLICY`, which registers itself.
+"""The table of policies: all that the `POLICIES` of the modules here hold.
 
-To add a policy, write one file with a `POLICY = Policy(name=<the file's name>, ...)`; the command
-line, the sweep, the report and the battery of tests then know it.
+To add a policy, write a file here with `POLICIES = (Policy(name=..., ...),)`. The command line, the
+sweep, the report and the battery of tests then know it.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from bavs_jax.selection.policy import Policy
 
 
 def collect_policies() -> dict[str, Policy]:
-    """Imports every module of this package; raises SelectionError at one without its POLICY."""
+    """Imports every module of this package; raises SelectionError at one without `POLICIES`."""
     try:
-        return collect(__name__, __path__, "POLICY", "Policy")
+        return collect(__name__, __path__, "POLICIES", Policy)
     except ValueError as error:
         raise SelectionError(str(error)) from error
 

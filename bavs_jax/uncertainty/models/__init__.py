@@ -1,11 +1,13 @@
-"""The table of uncertainty models: every module here holds one `MODEL`, which registers itself."""
+"""The table of uncertainty models: all that `UNCERTAINTY_MODELS` of the modules here hold."""
 
 from __future__ import annotations
 
 from bavs_jax.registry import collect
 from bavs_jax.uncertainty.model import UncertaintyModel
 
-MODELS: dict[str, UncertaintyModel] = collect(__name__, __path__, "MODEL", "UncertaintyModel")
+MODELS: dict[str, UncertaintyModel] = collect(
+    __name__, __path__, "UNCERTAINTY_MODELS", UncertaintyModel
+)
 
 
 def get_model(name: str) -> UncertaintyModel:

@@ -59,8 +59,10 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
     return ModelFns(fit, render)
 
 
-MODEL = UncertaintyModel(
-    name="cf_nerf",
-    summary="Variance over draws of a distribution over fields, by conditional flows.",
-    make_fns=make_fns,
+UNCERTAINTY_MODELS = (
+    UncertaintyModel(
+        name="cf_nerf",
+        summary="Variance over draws of a distribution over fields, by conditional flows.",
+        make_fns=make_fns,
+    ),
 )

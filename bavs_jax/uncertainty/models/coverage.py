@@ -95,8 +95,10 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
     return ModelFns(fit, render, condition)
 
 
-MODEL = UncertaintyModel(
-    name="coverage",
-    summary="How new the direction is from which each point is looked at.",
-    make_fns=make_fns,
+UNCERTAINTY_MODELS = (
+    UncertaintyModel(
+        name="coverage",
+        summary="How new the direction is from which each point is looked at.",
+        make_fns=make_fns,
+    ),
 )

@@ -28,8 +28,10 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
     return ModelFns(fit, render)
 
 
-MODEL = UncertaintyModel(
-    name="ensemble",
-    summary="Variance of colour over several fields, and what they miss of the ray.",
-    make_fns=make_fns,
+UNCERTAINTY_MODELS = (
+    UncertaintyModel(
+        name="ensemble",
+        summary="Variance of colour over several fields, and what they miss of the ray.",
+        make_fns=make_fns,
+    ),
 )

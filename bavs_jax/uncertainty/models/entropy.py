@@ -18,8 +18,10 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
     )
 
 
-MODEL = UncertaintyModel(
-    name="entropy",
-    summary="Entropy of where each ray ends, times its opacity.",
-    make_fns=make_fns,
+UNCERTAINTY_MODELS = (
+    UncertaintyModel(
+        name="entropy",
+        summary="Entropy of where each ray ends, times its opacity.",
+        make_fns=make_fns,
+    ),
 )

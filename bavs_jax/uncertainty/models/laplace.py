@@ -74,8 +74,10 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
     return ModelFns(fit, render)
 
 
-MODEL = UncertaintyModel(
-    name="laplace",
-    summary="Laplace approximation on the deformation grid: how far a point may be displaced.",
-    make_fns=make_fns,
+UNCERTAINTY_MODELS = (
+    UncertaintyModel(
+        name="laplace",
+        summary="Laplace approximation on the deformation grid: how far a point may be displaced.",
+        make_fns=make_fns,
+    ),
 )

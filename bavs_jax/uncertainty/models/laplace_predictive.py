@@ -33,8 +33,10 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
     return ModelFns(fit, render)
 
 
-MODEL = UncertaintyModel(
-    name="laplace_predictive",
-    summary="Standard deviation of colour and depth under the Laplace posterior, to first order.",
-    make_fns=make_fns,
+UNCERTAINTY_MODELS = (
+    UncertaintyModel(
+        name="laplace_predictive",
+        summary="Deviation of colour and depth under the Laplace posterior, to first order.",
+        make_fns=make_fns,
+    ),
 )

@@ -34,8 +34,10 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
     return ModelFns(fit, render)
 
 
-MODEL = UncertaintyModel(
-    name="learned_variance",
-    summary="Variance of colour that the field learns by likelihood (ActiveNeRF).",
-    make_fns=make_fns,
+UNCERTAINTY_MODELS = (
+    UncertaintyModel(
+        name="learned_variance",
+        summary="Variance of colour that the field learns by likelihood (ActiveNeRF).",
+        make_fns=make_fns,
+    ),
 )

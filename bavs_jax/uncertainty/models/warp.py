@@ -39,8 +39,10 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
     return ModelFns(fit, render)
 
 
-MODEL = UncertaintyModel(
-    name="warp",
-    summary="Disagreement of a render with training views warped into it by depth.",
-    make_fns=make_fns,
+UNCERTAINTY_MODELS = (
+    UncertaintyModel(
+        name="warp",
+        summary="Disagreement of a render with training views warped into it by depth.",
+        make_fns=make_fns,
+    ),
 )
