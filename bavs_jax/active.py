@@ -44,8 +44,7 @@ class Choice(NamedTuple):
     selected: np.ndarray  # [k] the same as indices of the candidates
     candidates: Candidates
     selection: SelectionInfo
-    seconds: dict[str, float]  # curvature, fit, score, select, predict
-    predicted: dict[str, float | None] | None = None  # what it may be worth (see `prediction.py`)
+    seconds: dict[str, float]  # curvature, fit, score, select
 
 
 class RoundInfo(NamedTuple):
@@ -64,14 +63,12 @@ class Stages(NamedTuple):
     `restart(key, train_state) -> train_state` at the start of each round after the first: a fresh
       optimiser, and fresh parameters too where each round trains from scratch.
     `sources(policy, key, situation, candidates) -> Sources` (see `sources.py`)
-    `predict(situation, candidates, batches) -> list of dicts` (see `prediction.py`), or None.
     """
 
     train_call: Callable
     init: Callable
     restart: Callable
     sources: Callable
-    predict: Callable | None = None
 
 
 def init_active_state(train: TrainState, table: PixelTable, initial_views) -> ActiveState:
@@ -148,10 +145,6 @@ def make_active_step(
         )
         elapsed = time.perf_counter() - start
         seconds = {**sources.seconds, "select": elapsed - sum(sources.seconds.values())}
-        predicted, start = None, time.perf_counter()
-        if stages.predict is not None:
-            (predicted,) = stages.predict(situation, candidates, [selected])
-        seconds["predict"] = time.perf_counter() - start
         table, view_ids = source.acquire(state.table, state.is_training_view, candidates, selected)
         state = state.replace(
             table=table,
@@ -160,7 +153,7 @@ def make_active_step(
             calls=jnp.int32(0),
             restarts=jnp.int32(0),
         )
-        return state, Choice(view_ids, selected, candidates, selection, seconds, predicted)
+        return state, Choice(view_ids, selected, candidates, selection, seconds)
 
     def step(key, state, on_choice=None, on_call=None):
         choice = None

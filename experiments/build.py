@@ -16,7 +16,6 @@ from bavs_jax import active
 from bavs_jax.devices import num_shards, put_on_all
 from bavs_jax.fields.deformation import DeformationGrid, offset_unit
 from bavs_jax.metrics.perceptual import make_lpips_fn
-from bavs_jax.prediction import make_predict_fn
 from bavs_jax.scenes import Scene
 from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
@@ -192,14 +191,9 @@ def build_problem(
         return is_stuck(info, colour_spread(state.table, state.is_training_view))
 
     def make_step(policy_name: str, initial, track: Callable, label: str):
-        predict = None
-        if config.predict_gain:
-            predict = make_predict_fn(
-                make_toolbox(track), image_scale=config.candidates.image_scale
-            )
         return active.make_active_step(
             get_policy(policy_name),
-            active.Stages(trainer.call, trainer.init, restart, sources_fn(track), predict),
+            active.Stages(trainer.call, trainer.init, restart, sources_fn(track)),
             source,
             centre=scene.centre,
             batch_size=config.batch_size,

@@ -9,8 +9,6 @@ from functools import partial
 from experiments.bench import results as bench
 from experiments.bench.same_numbers import DEVICE_FILE, differences_table
 from experiments.posthoc.tables import TABLES as POSTHOC_TABLES
-from experiments.predicted.results import RESULT_FILE as GAIN_FILE
-from experiments.predicted.results import correlation_table, stop_table
 from experiments.report.collected import Collected, collect_tables
 from experiments.report.results import read_result
 from experiments.report.tables import Table
@@ -43,14 +41,6 @@ def _posthoc(make_table: Callable[[list[dict]], Table], path: pathlib.Path) -> C
     return Collected(_made_by(result, over), {path.stem: make_table(result["rows"])})
 
 
-def _gain(path: pathlib.Path) -> Collected:
-    """How well predicted gains tell realised ones, and the stop rule tried on left-out seeds."""
-    result = read_result(path)
-    made = "; ".join(f"`{command}`" for command in result["commands"])
-    tables = {"correlation": correlation_table(result), "stop": stop_table(result, "seed")}
-    return Collected(f"{made}: {len(result['cases'])} batches", tables)
-
-
 def _device(path: pathlib.Path) -> Collected:
     """How far an accelerator's numbers are from the CPU's."""
     result = read_result(path)
@@ -61,7 +51,6 @@ def _device(path: pathlib.Path) -> Collected:
 
 FILES: dict[str, Callable[[pathlib.Path], Collected]] = {
     uncertain.NAME: _uncertainty,
-    GAIN_FILE: _gain,
     DEVICE_FILE: _device,
     bench.BENCHMARK: bench.benchmark_tables,
     bench.QUALITY: bench.quality_tables,

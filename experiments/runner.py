@@ -26,7 +26,6 @@ from experiments.files import append_line, read_json, write_arrays, write_json
 from experiments.keys import run_key, stream_key
 from experiments.machine import device_name, peak_memory_mb, versions
 from experiments.parts import Part, is_completed, is_finished
-from experiments.predicted.cases import realised_gain
 from experiments.processes import as_first_process, is_first_process
 from experiments.progress import track
 from experiments.report.choices import bound_words
@@ -169,7 +168,6 @@ class Run:
                 int(info.survivors_farthest_overlap) if info.filter else None
             ),
             "batch_bound": info.bound._asdict() if info.bound else None,
-            "predicted": choice.predicted,
         }
         self._log(event="choice", round=number, **self.pending)
         if info.bound:
@@ -184,8 +182,6 @@ class Run:
             pending["selected"] = self.initial.tolist()
         pending["seconds"]["evaluate"] = time.monotonic() - start
         row = {"num_views": int(state.is_training_view.sum()), **pending, **measures}
-        if self.rounds:
-            row["realised_db"] = realised_gain(self.rounds[-1], row)
         self.rounds.append(row)
         self.pending = _new_pending()
         self._save(state)
@@ -289,7 +285,7 @@ class Run:
 
 
 def _new_pending() -> dict:
-    names = ("train", "curvature", "fit", "score", "select", "predict", "evaluate")
+    names = ("train", "curvature", "fit", "score", "select", "evaluate")
     seconds = dict.fromkeys(names, 0.0)
     return {"selected": [], "seconds": seconds, "restarts": 0, "stuck": False}
 

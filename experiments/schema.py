@@ -136,7 +136,6 @@ SCHEMA = {
     "num_test": _views("all"),
     "num_test_final": _views("all"),
     "num_pictures": _views("all"),
-    "predict_gain": FLAG,
     "lpips_net": choice("", *NETS),
     "checkpoint_seconds": number(0.0, MAX_VALUE),
     "field_kind": choice(*SAMPLERS),

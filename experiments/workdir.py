@@ -13,7 +13,7 @@ SUMMARY_VERSION = 1
 # What may differ when a folder is taken up again: more policies or seeds add runs.
 EXTENSIBLE = (
     *("policies", "seeds", "checkpoint_seconds", "data_dir", "num_pictures"),
-    *("evaluation.models", "evaluation.variant", "predict_gain"),
+    *("evaluation.models", "evaluation.variant"),
 )
 
 

@@ -33,7 +33,6 @@ WORK = {
     "experiments.export_field": ("script.trained_runs",),
     "experiments.clean_up": ("script.trained_runs",),
     "experiments.posterior_draws": ("script.trained_runs",),
-    "experiments.predicted_gain": ("compare",),
     "experiments.report.__main__": ("write_report",),
 }
 

@@ -27,7 +27,6 @@ READS = {
     "export_field": (None, "config.json"),
     "figures": (None, "summary.json"),
     "posterior_draws": (None, "config.json"),
-    "predicted_gain": (None, "summary.json"),
     "remeasure": (None, "config.json"),
     "report": (None, "summary.json"),
     "suggest_views": ("--data={}/data", "config.json"),

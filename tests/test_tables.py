@@ -212,6 +212,47 @@ def test_settings_that_set_different_options_go_by_their_names(tmp_path):
     assert [row[0].text for row in table.rows] == [*changes]
 
 
+def settings_of(tmp_path, all_values):
+    """The settings table of a sweep whose n-th setting ends n dB above the first."""
+    rows = []
+    for number, values in enumerate(all_values):
+        name = ",".join(f"{option}={value}" for option, value in values.items())
+        rows.append({"folder": name, "values": values, "policies": ["bavs"], "seeds": [0]})
+        result = make_result("bavs", 0)
+        result["rounds"][-1]["psnr"] = 20.0 + number
+        write_workdir(tmp_path / name, [result], arrays=False)
+    write_record(tmp_path, Record("the command", rows, {}))
+    return collect_tables(tmp_path).tables["settings"]
+
+
+def test_a_setting_is_compared_with_the_first_that_is_most_like_it(tmp_path):
+    grid = [
+        {"scene": scene, "num_initial": views, "train.num_steps": steps}
+        for scene in ("lego", "ship")
+        for views in (8, 12)
+        for steps in (1, 3)
+    ]
+    table = settings_of(tmp_path, grid)
+    assert table.head[-1] == "PSNR gap to train.num_steps=1 (dB)"
+    assert [row[-1].text for row in table.rows] == ["—", "+1.00"] * 4
+
+
+def test_options_that_change_together_are_compared_within_a_scene(tmp_path):
+    both = [
+        {"scene": scene, "from_scratch": anew, "train.num_steps": steps}
+        for scene in ("lego", "ship")
+        for anew, steps in ((True, 3), (False, 1))
+    ]
+    table = settings_of(tmp_path, both)
+    assert table.head[-1] == "PSNR gap to from_scratch=True,train.num_steps=3 (dB)"
+    assert [row[-1].text for row in table.rows] == ["—", "+1.00"] * 2
+
+
+def test_scenes_are_not_compared_with_each_other(tmp_path):
+    rows = [{"loader": "blender", "scene": s, "train.num_rays": 2} for s in ("lego", "ship")]
+    assert settings_of(tmp_path, rows).head[-1] == "Depth error (scene units)"
+
+
 def make_scenes(folder, names=("lego", "ship")):
     """A sweep over scenes: each is 2 dB above the one before, and one run is missing."""
     rows = []
@@ -311,7 +352,10 @@ def test_a_page_names_its_rows(tmp_path):
     "page",
     [
         "README.md",
-        *(f"experiments/results/{n}.md" for n in ("README", "POLICIES", "PAPER", "TRIES")),
+        *(
+            f"experiments/results/{n}.md"
+            for n in ("README", "POLICIES", "PAPER", "FIELDS", "TRIES")
+        ),
     ],
 )
 def test_pages_show_what_the_result_files_say(page):

@@ -10,7 +10,6 @@ import pytest
 
 from bavs_jax import active
 from bavs_jax.cameras import take
-from bavs_jax.prediction import summed_curvature
 from bavs_jax.sources import WEIGHTING, make_candidate_curvature_fn, training_looks
 from bavs_jax.training.batches import num_training_pixels, training_pixels
 from bavs_jax.uncertainty.model import Situation
@@ -93,9 +92,6 @@ def test_candidates_are_read_with_the_mean_code(whole):
     group = np.array([5, 2])
     got = candidate_fn(problem, situation)(group)
     assert_equal_sums(got, candidate_fn(problem, plain)(group))
-    toolbox = problem.make_toolbox(silent)
-    summed = summed_curvature(toolbox, situation, situation.candidates, group, SCALE)
-    assert_equal_sums(summed, np.asarray(got, np.float64).sum(axis=0))
     other = with_codes(situation.train, mean + 1.0)
     other = candidate_fn(problem, situation._replace(train=other))(group)
     assert np.abs(np.asarray(other) - got).max() > 0.05 * np.abs(got).max(), "codes must matter"
@@ -113,11 +109,6 @@ def assert_looks_are_the_training_curvature(problem, situation):
     jac_sq_sum = training_curvature(KEY, toolbox, situation, WEIGHTING)
     want = 2.0 / situation.num_rays * np.asarray(jac_sq_sum)
     assert_equal_sums(total_of(toolbox, training_looks(toolbox, situation, 1.0)), want)
-    table = situation.table
-    assert_equal_sums(
-        summed_curvature(toolbox, situation, table.cameras, TAKEN, 1.0, table),
-        want,
-    )
 
 
 def test_training_views_are_looked_at_with_their_own_codes(whole):

@@ -32,7 +32,6 @@ def get_config() -> ConfigDict:
     config.num_test = 25  # test views between rounds, evenly spaced in the test split; 0: all
     config.num_test_final = 0  # test views after the last round; 0: all
     config.num_pictures = 4  # test views shown in the report, of the first seed
-    config.predict_gain = False  # record what each batch may be worth (experiments.predicted_gain)
     config.lpips_net = "alex"  # "alex", "vgg" or "" for none; needs bavs_jax[lpips]
     config.checkpoint_seconds = 30.0  # at most this much work is lost when a run is killed
 

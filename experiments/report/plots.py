@@ -26,7 +26,6 @@ PARTS = {
     "fit": ("training other fields", VERMILION),
     "score": ("scoring candidates", GREEN),
     "select": ("selecting", PURPLE),
-    "predict": ("predicting the gain", BLACK),
     "evaluate": ("measuring on test views", SKY),
 }
 MIN_BAND = 3  # seeds; an interval over two is 13 standard errors wide and hides all else

@@ -1,4 +1,4 @@
-"""A sweep over options as one table: each setting against random choice and against the first."""
+"""A sweep over options as one table: each setting against random choice and against another."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from experiments.report.results import Run
 from experiments.report.tables import Cell, Table, dash, interval_cell, missing_measure
 
 REFERENCE = "random"
+SCENE_OPTIONS = ("loader", "data_dir", "scene")  # PSNRs of two scenes are no gap
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,15 +31,19 @@ def settings_table(settings: list[Setting], *, compared: bool = True) -> Table:
 
     Args:
       settings: at least one.
-      compared: whether there is a column of gaps to the first setting.
+      compared: whether there is a column of gaps between settings, see `_references`.
     """
     options = [*settings[0].values] if len({(*s.values,) for s in settings}) == 1 else []
+    references = _references(settings, options)
+    compared = compared and any(first is not None for first, _ in references.values())
     measures = [m for m in stats.MEASURES if any(_has(s.runs, m.key) for s in settings)]
     to_random = any(REFERENCE in s.policies and len(s.policies) > 1 for s in settings)
     head = [*(options or ["setting"]), "policy", "seeds", "views"]
     head += [f"{m.label} ({m.unit})" if m.unit else m.label for m in measures]
     head += [f"PSNR gap to {REFERENCE} (dB)"] * to_random
-    head += [f"PSNR gap to {settings[0].name} (dB)"] * compared
+    words = {words for first, words in references.values() if first is not None}
+    other = words.pop() if len(words) == 1 else "the first of its kind"
+    head += [f"PSNR gap to {other} (dB)"] * compared
     rows = []
     for setting in settings:
         fixed = [Cell(str(setting.values[o])) for o in options] or [Cell(setting.name)]
@@ -47,9 +52,35 @@ def settings_table(settings: list[Setting], *, compared: bool = True) -> Table:
             if to_random:
                 cells.append(_reference_gap(setting, policy))
             if compared:
-                cells.append(_setting_gap(setting, settings[0], policy))
+                cells.append(_setting_gap(setting, references[setting.name][0], policy))
             rows.append((*fixed, Cell(policy), *cells))
     return Table(tuple(head), tuple(rows))
+
+
+def _references(
+    settings: list[Setting], options: list[str]
+) -> dict[str, tuple[Setting | None, str]]:
+    """What each setting is compared with, by name, and in which options that one differs.
+
+    The first setting that has the most of the leading options in common with it: in a sweep over
+    views and steps, that of as many views. None where there is no other of the same scene. Where
+    settings differ in what they set, all are compared with the very first.
+    """
+    if not options:
+        return {s.name: (settings[0], settings[0].name) for s in settings}
+    found = {}
+    for setting in settings:
+        for depth in range(len(options) - 1, -1, -1):
+            shared = (*options[:depth], *(o for o in SCENE_OPTIONS if o in options))
+            alike = [s for s in settings if all(s.values[o] == setting.values[o] for o in shared)]
+            if len(alike) > 1:
+                first = alike[0]
+                words = ",".join(f"{o}={first.values[o]}" for o in options if o not in shared)
+                found[setting.name] = first, words
+                break
+        else:
+            found[setting.name] = None, ""
+    return found
 
 
 def _row(setting: Setting, policy: str, measures) -> list[Cell]:
@@ -80,10 +111,12 @@ def _reference_gap(setting: Setting, policy: str) -> Cell:
     return interval_cell(pair.gap if pair else None, 2, why, gap=True)
 
 
-def _setting_gap(setting: Setting, first: Setting, policy: str) -> Cell:
+def _setting_gap(setting: Setting, first: Setting | None, policy: str) -> Cell:
     """Each at its own last number of views: an option may change how many there are."""
     if not stats.completed(setting.runs, policy):
         return dash(_no_run(setting, policy))
+    if first is None:
+        return dash(f"{setting.name}: no other setting of this scene")
     if setting is first:
         return dash("a setting has no gap to itself")
     ours, theirs = (
