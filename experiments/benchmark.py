@@ -18,7 +18,7 @@ from ml_collections import config_flags
 from experiments import runtime
 from experiments.bench.measure import benchmark
 from experiments.bench.results import BENCHMARK, benchmark_tables
-from experiments.bench.settings import check_sizes, default_sizes
+from experiments.bench.subject import check_sizes, default_sizes
 from experiments.configs import base
 from experiments.report.collected import collected_text
 from experiments.schema import given_config

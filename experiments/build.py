@@ -21,15 +21,15 @@ from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.sources import SourceOptions, make_sources_fn
 from bavs_jax.training.batches import PixelTable, make_pixel_table, num_training_pixels
-from bavs_jax.training.health import check_call, colour_spread, is_stuck
+from bavs_jax.training.fit import check_call, colour_spread, is_stuck
 from bavs_jax.training.train import TrainState
+from bavs_jax.uncertainty.measures import make_true_error_fn
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, LaplaceOptions, Toolbox
 from bavs_jax.uncertainty.models import MODELS
 from bavs_jax.uncertainty.models.laplace import laplace_variance
 from bavs_jax.uncertainty.posterior import default_prior_weight
 from bavs_jax.uncertainty.scoring import make_render_chunk_fn
 from bavs_jax.uncertainty.streaming import curvature_group_size, make_curvature_fn
-from bavs_jax.uncertainty.true_error import make_true_error_fn
 from experiments.build_field import field_background
 from experiments.build_scene import make_source
 from experiments.build_trainer import KINDS, build_trainer, calls_per_round, train_aside

@@ -14,8 +14,7 @@ from bavs_jax.fields.base import Field
 from bavs_jax.fields.flow_field import FlowField, mean_field
 from bavs_jax.rendering.samplers import Sampler
 from bavs_jax.scenes import Scene
-from bavs_jax.training.fit import fit
-from bavs_jax.training.health import check_call
+from bavs_jax.training.fit import check_call, fit
 from bavs_jax.training.objectives import (
     make_colour_objective,
     make_flow_objective,

@@ -24,9 +24,14 @@ from experiments.build import RENDER_CHUNK
 from experiments.evaluate import spread_evenly
 from experiments.files import write_json
 from experiments.posthoc import script
-from experiments.posthoc.cleanup_figures import sweep_figure, views_figure
-from experiments.posthoc.cleanup_results import in_words, summary
-from experiments.posthoc.cleanup_sweep import make_cleaned_chunk_fn, sweep_views
+from experiments.posthoc.cleanup import (
+    in_words,
+    make_cleaned_chunk_fn,
+    summary,
+    sweep_figure,
+    sweep_views,
+    views_figure,
+)
 from experiments.report.panels import save_figure
 from experiments.trained import TrainedRun, run_curvature, run_variance
 

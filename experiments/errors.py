@@ -1,6 +1,6 @@
 """What can be wrong with what a user gives: each error is one line with the fix."""
 
-from bavs_jax.export.extras import ExportError
+from bavs_jax.export.formats import ExportError
 from bavs_jax.placement.collect import PlacementError
 from bavs_jax.scenes import SceneError
 from bavs_jax.selection.context import SelectionError

@@ -24,15 +24,13 @@ import time
 
 from absl import flags
 
-from bavs_jax.export.cloud import MIN_OPACITY
-from bavs_jax.export.grid import grid_axes
+from bavs_jax.export.field import MIN_OPACITY, grid_axes
 from bavs_jax.export.mesh import default_threshold
 from bavs_jax.scenes.poses import user_units
 from experiments.build_scene import true_surface
 from experiments.files import write_json
 from experiments.posthoc import field_files, script
-from experiments.posthoc.points import scene_point_fn
-from experiments.posthoc.slices import slices_figure
+from experiments.posthoc.points import scene_point_fn, slices_figure
 from experiments.report.panels import save_figure
 from experiments.trained import TrainedRun, run_curvature, run_variance
 

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and read with one-line errors."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from experiments.errors import WorkdirError
-from experiments.processes import is_first_process
 from experiments.runtime import warn
+from experiments.signals import is_first_process
 
 
 def write_atomic(path: str | os.PathLike, write_fn: Callable) -> None:
@@ -145,3 +145,32 @@ def exclusive(folder: str | os.PathLike) -> Iterator[None]:
             print(f"{folder}: another process works here; waiting for its end", flush=True)
             fcntl.flock(file, fcntl.LOCK_EX)
         yield
+
+
+def read_versioned(
+    path: str | os.PathLike, version: int, *, error: type[Exception], absent: str, fix: str
+) -> dict:
+    """The content of a JSON object whose `schema_version` this program knows.
+
+    Args:
+      path: of the file.
+      version: that it must have.
+      error: what to raise.
+      absent: what to do where there is no file, in the imperative.
+      fix: what to do where it is broken or of another version.
+
+    Raises:
+      error: one line that names the file, the field and the fix.
+    """
+    try:
+        content = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise error(f"{path}: no such file; {absent}") from None
+    except ValueError as problem:  # not JSON, or not text
+        raise error(f"{path}: not JSON ({problem}); {fix}") from None
+    if not isinstance(content, dict):
+        raise error(f"{path}: not a JSON object; {fix}")
+    found = content.get("schema_version")
+    if found != version:
+        raise error(f"{path}: schema_version is {found}, this program reads {version}; {fix}")
+    return content

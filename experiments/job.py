@@ -19,7 +19,7 @@ from jax.sharding import Mesh
 
 from bavs_jax.devices import make_mesh
 from experiments.errors import ConfigError, shown
-from experiments.processes import is_first_process
+from experiments.signals import is_first_process
 
 FLAGS = flags.FLAGS
 flags.DEFINE_integer("devices", 1, "Devices that share the rays of one run; 0: all there are.", 0)

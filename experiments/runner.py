@@ -14,22 +14,26 @@ import numpy as np
 from bavs_jax.active import ActiveState, Choice, init_active_state
 from bavs_jax.training.batches import num_training_pixels
 from bavs_jax.training.checkpoints import Checkpoints
-from bavs_jax.training.health import MAX_RESTARTS
+from bavs_jax.training.fit import MAX_RESTARTS
 from bavs_jax.uncertainty.model import Situation
 from experiments import acquisitions
-from experiments.baselines import measure_baselines
 from experiments.build import Problem
 from experiments.build_scene import initial_views
 from experiments.errors import WorkdirError
-from experiments.evaluate import measure_test_views, picture_arrays, spread_evenly
+from experiments.evaluate import (
+    measure_baselines,
+    measure_test_views,
+    picture_arrays,
+    spread_evenly,
+)
 from experiments.files import append_line, read_json, write_arrays, write_json
 from experiments.keys import run_key, stream_key
 from experiments.machine import device_name, peak_memory_mb, versions
 from experiments.parts import Part, is_completed, is_finished
-from experiments.processes import as_first_process, is_first_process
 from experiments.progress import track
 from experiments.report.choices import bound_words
 from experiments.runtime import warn
+from experiments.signals import as_first_process, is_first_process
 
 SCHEMA_VERSION = 1
 LOG_EVERY = 10  # training calls between two lines of metrics.jsonl

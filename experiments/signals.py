@@ -1,7 +1,4 @@
-"""Ctrl-C and SIGTERM: one line, and the exit code that shells give for them.
-
-`experiments/__init__.py` imports this before anything slow, so it needs nothing but Python.
-"""
+"""Signals: what ends a script, and how its processes go with it."""
 
 from __future__ import annotations
 
@@ -10,6 +7,23 @@ import signal
 import sys
 from collections.abc import Callable
 from typing import NoReturn
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+
+def is_first_process() -> bool:
+    """Whether this process is the one that writes files."""
+    return not jax.distributed.is_initialized() or jax.process_index() == 0
+
+
+def as_first_process(value: bool) -> bool:
+    """What the first process says, so that all do the same where clocks or files differ."""
+    if not jax.distributed.is_initialized():
+        return value
+    return bool(multihost_utils.broadcast_one_to_all(np.array(value)))
+
 
 CODES = {signal.SIGINT: 130, signal.SIGTERM: 143}
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.baselines import image_psnr, measure_baselines
+from experiments.evaluate import image_psnr, measure_baselines
 from tests.toy_scenes import toy_scene
 
 

@@ -11,16 +11,19 @@ import pytest
 from bavs_jax.selection.batch import SelectionInfo, acquire
 from bavs_jax.selection.distances import pairwise_distances
 from bavs_jax.selection.policies import get_policy
-from experiments.bench.ceilings import measure_ceilings
-from experiments.bench.clock import timed, timed_runs
-from experiments.bench.counts import Work, compiled_work
-from experiments.bench.fits import fit_growth
 from experiments.bench.measure import benchmark
-from experiments.bench.plots import ceiling_plot
+from experiments.bench.page import ceiling_plot
 from experiments.bench.results import BENCHMARK, STAGES, amount, benchmark_tables, duration
-from experiments.bench.settings import default_sizes
 from experiments.bench.stages import make_selection_run
-from experiments.bench.subject import make_subject
+from experiments.bench.subject import default_sizes, make_subject
+from experiments.bench.timing import (
+    Work,
+    compiled_work,
+    fit_growth,
+    measure_ceilings,
+    timed,
+    timed_runs,
+)
 from experiments.bench.work import selection_work, slot_width
 from experiments.build_scene import load_config_scene
 from experiments.report.collected import collected_text
@@ -129,7 +132,7 @@ def test_slot_width_holds_the_mean_ray(mean, width):
 def test_ceilings_are_what_the_best_run_reached(monkeypatch):
     """With a clock that says 4 s, then 2 s, for each kind of program."""
     runs = iter([([4.0, 2.0], []), ([4.0, 2.0], [])])
-    monkeypatch.setattr("experiments.bench.ceilings.timed_runs", lambda fn, repeats: next(runs))
+    monkeypatch.setattr("experiments.bench.timing.timed_runs", lambda fn, repeats: next(runs))
     ceilings = measure_ceilings(matmul=100, copy_mb=1, repeats=2)
     assert ceilings.flops_per_s == 2 * 100**3 / 2.0
     assert ceilings.bytes_per_s == 2 * 10**6 / 2.0
@@ -138,7 +141,7 @@ def test_ceilings_are_what_the_best_run_reached(monkeypatch):
 def test_timing_waits_for_the_result(monkeypatch):
     """With a clock that only work moves: 1 s until a call returns, 5 s more for each result."""
     now = [0.0]
-    monkeypatch.setattr("experiments.bench.clock.time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("experiments.bench.timing.time.perf_counter", lambda: now[0])
 
     class Pending:
         def block_until_ready(self):

@@ -24,7 +24,7 @@ from bavs_jax.selection.directional import same_side
 from bavs_jax.selection.distances import pairwise_distances
 from bavs_jax.selection.policies.distance import great_circle
 from bavs_jax.training.batches import view_pixel_rays
-from bavs_jax.uncertainty import active_gain, coverage, curvature, entropy, visibility, warp
+from bavs_jax.uncertainty import curvature, measures, warp
 
 SIZES = (1_000, 10_923, 16_384, 20_000, 32_768, 43_680, 50_000)
 NUM_VIEWS, NUM_SAMPLES = 5, 6
@@ -123,11 +123,11 @@ def projected(cameras, points):
 
 
 def seen(cameras, points):
-    return visibility.look_at_points(cams.take(cameras, 0), points, jnp.full((48, 64), 2.0))[1]
+    return measures.look_at_points(cams.take(cameras, 0), points, jnp.full((48, 64), 2.0))[1]
 
 
 def novelty(cameras, points, directions):
-    return coverage.direction_novelty(points, directions, cameras, jnp.ones(len(cameras), bool))
+    return measures.direction_novelty(points, directions, cameras, jnp.ones(len(cameras), bool))
 
 
 def warped_depth(cameras, points, directions, colours):
@@ -218,8 +218,8 @@ CASES = {
     "distances": (lambda a: pairwise_distances(a, jnp.eye(3)), "points"),
     "composite": (composited, "widths", "weights", "colours"),
     "expected depth": (compositing.expected_depth, "weights", "widths"),
-    "ray entropy": (functools.partial(entropy.ray_entropy, by_opacity=False), "weights"),
-    "variance reduction": (active_gain.variance_reduction, "weights", "widths"),
+    "ray entropy": (functools.partial(measures.ray_entropy, by_opacity=False), "weights"),
+    "variance reduction": (measures.variance_reduction, "weights", "widths"),
     "resample": (resampled, "widths", "weights"),
     "weigh by the residual": (weighted_jacobian, "jacobian", "colours"),
 }

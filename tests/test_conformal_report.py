@@ -13,8 +13,7 @@ from bavs_jax.uncertainty.conformal_report import (
     share_by_decile,
     to_json,
 )
-from bavs_jax.uncertainty.conformal_scale import SCALES, ViewErrors
-from bavs_jax.uncertainty.conformal_split import split_views
+from bavs_jax.uncertainty.conformal_scale import SCALES, ViewErrors, split_views
 from tests.toy_errors import differing_views
 
 

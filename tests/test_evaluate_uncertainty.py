@@ -11,7 +11,7 @@ import pytest
 
 from bavs_jax.metrics.ause import sparsification
 from experiments.uncertain import measure
-from experiments.uncertain.calibration_file import calibration_path, load_calibration
+from experiments.uncertain.files import calibration_path, load_calibration
 from experiments.uncertain.results import mean_curves, row_path
 from tests.toy_runs import toy_flags
 from tests.toy_scenes import toy_scene

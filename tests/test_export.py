@@ -11,13 +11,16 @@ import pytest
 import trimesh
 
 from bavs_jax.cameras import Rays
-from bavs_jax.export.cloud import ray_end_points
-from bavs_jax.export.extras import ExportError, import_extra
-from bavs_jax.export.geometry import geometry_error, sample_mesh, seen_by_any
-from bavs_jax.export.grid import grid_axes, sample_grid
+from bavs_jax.export.field import (
+    geometry_error,
+    grid_axes,
+    ray_end_points,
+    sample_grid,
+    sample_mesh,
+    seen_by_any,
+)
+from bavs_jax.export.formats import ExportError, import_extra, nrrd_bytes, ply_bytes
 from bavs_jax.export.mesh import default_threshold, extract_mesh, without_small_parts
-from bavs_jax.export.ply import ply_bytes
-from bavs_jax.export.volume import nrrd_bytes
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.rendering.render import render_rays
 from bavs_jax.rendering.sampling import Samples

@@ -6,9 +6,8 @@ from PIL import Image
 
 from experiments.files import write_arrays
 from experiments.report import ReportError
-from experiments.report.figure_files import write_figures
+from experiments.report.figure_files import views_figure, write_figures
 from experiments.report.results import load_pictures, load_runs
-from experiments.report.views_figure import views_figure
 from tests.report_files import make_pictures, make_result, write_workdir
 
 

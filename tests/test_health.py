@@ -12,8 +12,7 @@ from bavs_jax import active
 from bavs_jax.candidates import dataset_candidates
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.training.batches import make_pixel_table
-from bavs_jax.training.fit import fit
-from bavs_jax.training.health import MAX_RESTARTS, check_call, colour_spread, is_stuck
+from bavs_jax.training.fit import MAX_RESTARTS, check_call, colour_spread, fit, is_stuck
 from bavs_jax.training.train import TrainInfo, TrainState
 from bavs_jax.uncertainty.model import Situation
 from experiments.build_trainer import Trainer, train_aside

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from bavs_jax.uncertainty.bands import add_bands
-from bavs_jax.uncertainty.conformal_split import ViewGroups
+from bavs_jax.uncertainty.conformal_scale import ViewGroups
 from experiments.errors import ConfigError, WorkdirError
-from experiments.uncertain.band_picture import band_arrays, band_strip, scanline_plot
-from experiments.uncertain.calibration_file import load_calibration, save_calibration
-from experiments.uncertain.image_file import load_images, save_images
+from experiments.uncertain.files import load_calibration, load_images, save_calibration, save_images
 from experiments.uncertain.intervals import (
     ViewSample,
     calibrate_samples,
@@ -19,6 +17,7 @@ from experiments.uncertain.intervals import (
     sample_views,
     split,
 )
+from experiments.uncertain.plots import band_arrays, band_strip, scanline_plot
 from tests.toy_scenes import toy_scene
 
 SIZE = 6

@@ -14,7 +14,7 @@ from bavs_jax.candidates import dataset_candidates
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid, offset_unit
 from bavs_jax.fields.flow_field import FlowField
-from bavs_jax.scenes.normalise import transform_poses
+from bavs_jax.scenes.poses import transform_poses
 from bavs_jax.selection.batch import acquire
 from bavs_jax.selection.context import make_context
 from bavs_jax.selection.policies import POLICIES
@@ -22,10 +22,10 @@ from bavs_jax.sources import SourceOptions, make_sources_fn
 from bavs_jax.training.batches import make_pixel_table
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.images import make_image_fn
+from bavs_jax.uncertainty.measures import make_true_error_fn
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE, Situation
 from bavs_jax.uncertainty.models import MODELS
 from bavs_jax.uncertainty.streaming import make_curvature_fn
-from bavs_jax.uncertainty.true_error import make_true_error_fn
 from experiments.build import build_problem
 from experiments.progress import track
 from tests.toy_fields import even_sampler

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from bavs_jax.metrics import depth, image, perceptual
+from bavs_jax.metrics import image, perceptual
 from tests import oracles_metrics
 
 
@@ -155,15 +155,15 @@ def test_depth_mae_counts_known_pixels_only():
     rendered = true_depth + rng.normal(size=true_depth.shape).astype(np.float32)
     expected = [oracles_metrics.depth_mae_by_pixels(*pair) for pair in zip(rendered, true_depth)]
     assert np.isnan(expected[2])
-    np.testing.assert_allclose(depth.depth_mae(rendered, true_depth), expected, rtol=1e-5)
+    np.testing.assert_allclose(image.depth_mae(rendered, true_depth), expected, rtol=1e-5)
 
 
 def test_depth_mae_of_a_constant_offset_ignores_what_lies_where_nothing_is_known():
     true_depth = np.float32([[2.0, 0.0], [3.0, 0.0]])
     rendered = np.where(true_depth > 0, true_depth + 0.5, np.nan).astype(np.float32)
-    np.testing.assert_allclose(depth.depth_mae(rendered, true_depth), 0.5)
+    np.testing.assert_allclose(image.depth_mae(rendered, true_depth), 0.5)
     with pytest.raises(ValueError, match="one shape"):
-        depth.depth_mae(rendered[0], true_depth)
+        image.depth_mae(rendered[0], true_depth)
 
 
 def test_lpips_missing_gives_a_reason_and_no_number(monkeypatch):

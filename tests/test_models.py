@@ -11,11 +11,11 @@ from bavs_jax.cameras import take
 from bavs_jax.sources import WEIGHTING, make_candidate_curvature_fn, training_looks
 from bavs_jax.training.batches import view_pixel_rays
 from bavs_jax.training.losses import gaussian_nll
+from bavs_jax.uncertainty.measures import make_true_error_fn
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
 from bavs_jax.uncertainty.models import MODELS, get_model
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from bavs_jax.uncertainty.scoring import mean_uncertainty, reduced_cameras
-from bavs_jax.uncertainty.true_error import make_true_error_fn
 from experiments.build import RENDER_CHUNK, build_problem
 from experiments.build_scene import initial_views, load_config_scene
 from experiments.progress import track

@@ -14,7 +14,7 @@ import pytest
 from bavs_jax.selection.policies import POLICIES
 from experiments.build import build_problem
 from experiments.configs.paper import table_3
-from experiments.report.printed import TABLES
+from experiments.report.paper_table import TABLES
 from tests.scene_files import write_nerfstudio
 from tests.toy_runs import OVERRIDES
 from tests.toy_scenes import toy_scene

@@ -7,13 +7,13 @@ import pytest
 
 from bavs_jax.numerics import opacity_or_empty, safe_divide, x_log_x
 from bavs_jax.rendering.compositing import rendered_variance
-from bavs_jax.uncertainty.active_gain import variance_reduction
-from bavs_jax.uncertainty.disagreement import (
+from bavs_jax.uncertainty.measures import (
     colour_variance,
     ensemble_uncertainty,
     missing_density,
+    ray_entropy,
+    variance_reduction,
 )
-from bavs_jax.uncertainty.entropy import ray_entropy
 from tests import oracles_pixel as oracles
 
 both_ways = pytest.mark.parametrize("by_opacity", [True, False])

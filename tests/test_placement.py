@@ -13,9 +13,8 @@ from bavs_jax.placement.clearance import (
     within_bounds,
 )
 from bavs_jax.placement.collect import PlacementError, Proposals, check_enough, collect_poses
-from bavs_jax.placement.focus import focus_point, share_facing
 from bavs_jax.placement.proposals import aim, box_positions, shell_positions, turned_targets
-from bavs_jax.placement.seen import count_seeing, in_unknown_space
+from bavs_jax.placement.seen import count_seeing, focus_point, in_unknown_space, share_facing
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -14,8 +14,8 @@ from experiments.report import (
     ReportError,
     camera_map,
     choices,
-    gaps,
     pictures,
+    plots,
     stats,
     tables,
     write_report,
@@ -119,9 +119,9 @@ def test_of_many_policies_the_few_that_matter_have_a_colour(tmp_path):
             result["rounds"][-1]["psnr"] = 20.0 + place + 0.1 * seed
             results.append(result)
     runs = load_runs(report_files.write_workdir(tmp_path, results, arrays=False))
-    coloured = gaps.in_colour(runs, names, "bavs")
+    coloured = plots.in_colour(runs, names, "bavs")
     assert coloured == ["bavs", "random", "farthest", "rival_6", "rival_5"]
-    assert gaps.in_colour(runs, names[:7], "bavs") == names[:7]
+    assert plots.in_colour(runs, names[:7], "bavs") == names[:7]
     num_views = stats.common_num_views(runs)
     found = stats.paired_gaps(runs, "farthest", "random", "psnr", num_views)
     np.testing.assert_allclose(found, [1.0, 1.0])

@@ -8,7 +8,8 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from bavs_jax.scenes import SceneError, load_nerfstudio, normalise
+from bavs_jax.scenes import SceneError, load_nerfstudio
+from bavs_jax.scenes import poses as poses_module
 from tests.scene_files import edit_json, random_image, write_nerfstudio
 
 
@@ -140,13 +141,13 @@ def random_poses(num: int, seed: int = 0) -> np.ndarray:
 
 def test_capture_becomes_upright_centred_and_of_unit_size():
     poses = random_poses(9)
-    similarity = normalise.level_and_scale(poses)
-    moved = normalise.transform_poses(similarity, poses)
+    similarity = poses_module.level_and_scale(poses)
+    moved = poses_module.transform_poses(similarity, poses)
     up = moved[:, :, 1].mean(axis=0)
     np.testing.assert_allclose(up / np.linalg.norm(up), [0.0, 0.0, 1.0], atol=1e-12)
     np.testing.assert_allclose(moved[:, :, 3].mean(axis=0), 0.0, atol=1e-12)
     np.testing.assert_allclose(np.abs(moved[:, :, 3]).max(), 1.0, rtol=1e-12)
-    back = normalise.transform_poses(np.linalg.inv(similarity), moved)
+    back = poses_module.transform_poses(np.linalg.inv(similarity), moved)
     np.testing.assert_allclose(back, poses, atol=1e-10)
 
 
@@ -155,7 +156,7 @@ def test_normalisation_does_not_depend_on_where_or_how_large_the_capture_was():
     shifted = poses.copy()
     shifted[:, :, 3] = 7.0 * poses[:, :, 3] + [1.0, 2.0, 3.0]
     first, second = (
-        normalise.transform_poses(normalise.level_and_scale(p), p) for p in (poses, shifted)
+        poses_module.transform_poses(poses_module.level_and_scale(p), p) for p in (poses, shifted)
     )
     np.testing.assert_allclose(second, first, atol=1e-12)
 
@@ -163,7 +164,7 @@ def test_normalisation_does_not_depend_on_where_or_how_large_the_capture_was():
 @pytest.mark.parametrize("seed", range(4))
 def test_rotation_between_is_the_shortest_rotation(seed):
     source, target = np.random.default_rng(seed).normal(size=(2, 3))
-    rotation = normalise.rotation_between(source, target)
+    rotation = poses_module.rotation_between(source, target)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     moved = rotation @ source / np.linalg.norm(source)
     np.testing.assert_allclose(moved, target / np.linalg.norm(target), atol=1e-12)
@@ -172,14 +173,14 @@ def test_rotation_between_is_the_shortest_rotation(seed):
 
 
 def test_rotation_between_parallel_directions():
-    np.testing.assert_allclose(normalise.rotation_between([0, 0, 2], [0, 0, 1]), np.eye(3))
-    turned = normalise.rotation_between([0, 0, -1], [0, 0, 1])
+    np.testing.assert_allclose(poses_module.rotation_between([0, 0, 2], [0, 0, 1]), np.eye(3))
+    turned = poses_module.rotation_between([0, 0, -1], [0, 0, 1])
     np.testing.assert_allclose(turned @ [0, 0, -1], [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(turned), 1.0)
 
 
 def test_a_single_camera_still_normalises():
-    similarity = normalise.level_and_scale(random_poses(1))
+    similarity = poses_module.level_and_scale(random_poses(1))
     assert np.isfinite(similarity).all()
     np.testing.assert_allclose(np.linalg.det(similarity[:3, :3]), 1.0)
 
@@ -187,7 +188,7 @@ def test_a_single_camera_still_normalises():
 def test_user_coordinates_come_back(tmp_path):
     root = write_nerfstudio(tmp_path)
     scene = load_nerfstudio(root)
-    back = normalise.transform_poses(scene.user_from_scene, scene.cameras.world_from_cam)
+    back = poses_module.transform_poses(scene.user_from_scene, scene.cameras.world_from_cam)
     frames = json.loads((root / "transforms.json").read_text())["frames"]
     user = np.array([frame["transform_matrix"] for frame in frames])[:, :3]
     np.testing.assert_allclose(back, user, atol=1e-5)  # float32 poses of size 4

@@ -12,7 +12,7 @@ import pytest
 from ml_collections import ConfigDict
 
 from experiments import configs
-from experiments.bench.settings import check_sizes, default_sizes
+from experiments.bench.subject import check_sizes, default_sizes
 from experiments.build_scene import check_views
 from experiments.configs import base, paper, quickstart
 from experiments.errors import ConfigError

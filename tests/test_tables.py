@@ -15,9 +15,9 @@ from experiments.posthoc.tables import cleanup_table, draws_table, geometry_tabl
 from experiments.report import ReportError, stats
 from experiments.report.collected import collect_tables, run_tables
 from experiments.report.formats import comma_separated, latex, markdown
-from experiments.report.over_scenes import mean_runs
-from experiments.report.printed import TABLES
+from experiments.report.paper_table import TABLES
 from experiments.report.results import load_runs
+from experiments.report.stats import mean_runs
 from experiments.report.tables import Cell, Table, interval_cell
 from experiments.sweeps.record import Record, write_record
 from experiments.tables import MARKED, fill_page, result_tables

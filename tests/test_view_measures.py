@@ -7,8 +7,7 @@ import pytest
 
 from bavs_jax.cameras import Rays, look_at, make_cameras
 from bavs_jax.rendering.compositing import composite
-from bavs_jax.uncertainty.coverage import direction_novelty
-from bavs_jax.uncertainty.visibility import at_nearest_pixel, look_at_points
+from bavs_jax.uncertainty.measures import at_nearest_pixel, direction_novelty, look_at_points
 from bavs_jax.uncertainty.warp import WarpSources, sample_bilinear, warp_disagreement
 from tests import oracles_pixel as oracles
 from tests.traces import count_traces

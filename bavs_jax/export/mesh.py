@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bavs_jax.export.extras import ExportError, import_extra
+from bavs_jax.export.formats import ExportError, import_extra
 from bavs_jax.placement.clearance import matter_density
 
 WALL_SHARE = 0.01  # of the longest side of the box

@@ -12,7 +12,7 @@ from bavs_jax.cameras import Cameras, rescale
 from bavs_jax.scenes import checks, folds, images, maps
 from bavs_jax.scenes.base import Scene, SceneError, alpha_table, pixel_table, printable
 from bavs_jax.scenes.extent import scene_extent
-from bavs_jax.scenes.normalise import level_and_scale, transform_poses
+from bavs_jax.scenes.poses import level_and_scale, transform_poses
 from bavs_jax.scenes.splits import choose_split
 
 

@@ -21,8 +21,7 @@ from bavs_jax.numerics import MIN_VARIANCE
 from bavs_jax.rendering.compositing import rendered_variance
 from bavs_jax.rendering.render import Rendering, render_rays
 from bavs_jax.training.batches import PixelBatch
-from bavs_jax.training.flow_loss import flow_loss
-from bavs_jax.training.losses import colour_loss, gaussian_nll, weighted_mean
+from bavs_jax.training.losses import colour_loss, flow_loss, gaussian_nll, weighted_mean
 
 
 class Outcome(NamedTuple):

@@ -10,7 +10,7 @@ from jax.scipy.ndimage import map_coordinates
 
 from bavs_jax.cameras import Cameras, Rays
 from bavs_jax.numerics import safe_divide
-from bavs_jax.uncertainty.visibility import DEFAULT_TOLERANCE, at_nearest_pixel, look_at_points
+from bavs_jax.uncertainty.measures import DEFAULT_TOLERANCE, at_nearest_pixel, look_at_points
 
 QUANTITIES = ("colour", "depth")
 COMBINATIONS = ("min", "mean")

@@ -10,9 +10,8 @@ import numpy as np
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import RECONSTRUCTION
 from experiments.bench import stages
-from experiments.bench.clock import timed, timed_runs
-from experiments.bench.fits import fit_growth
 from experiments.bench.subject import Subject, changed, draw_candidates, make_subject
+from experiments.bench.timing import fit_growth, timed, timed_runs
 from experiments.build_trainer import build_trainer
 from experiments.machine import peak_memory_mb
 from experiments.progress import track

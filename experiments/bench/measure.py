@@ -9,11 +9,11 @@ import jax
 
 from experiments import runtime
 from experiments.bench import stages
-from experiments.bench.ceilings import measure_ceilings
 from experiments.bench.growth import all_series, measure_growth
 from experiments.bench.page import benchmark_sections, write_page
 from experiments.bench.results import BENCHMARK, STAGES
 from experiments.bench.subject import make_subject, train_field
+from experiments.bench.timing import measure_ceilings
 from experiments.build_scene import load_config_scene
 from experiments.files import write_json
 from experiments.machine import device_name, peak_device_memory_mb, peak_memory_mb, versions

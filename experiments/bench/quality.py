@@ -9,8 +9,7 @@ import jax
 import numpy as np
 
 from bavs_jax.active import init_active_state, round_keys
-from bavs_jax.training.fit import fit
-from bavs_jax.training.health import check_call
+from bavs_jax.training.fit import check_call, fit
 from experiments import runtime
 from experiments.bench.subject import SEED
 from experiments.build import build_problem

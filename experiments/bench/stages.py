@@ -20,9 +20,6 @@ from bavs_jax.uncertainty.models.laplace import laplace_variance
 from bavs_jax.uncertainty.scoring import mean_uncertainty
 from bavs_jax.uncertainty.streaming import table_rays
 from experiments.bench import work
-from experiments.bench.ceilings import Ceilings
-from experiments.bench.clock import timed, timed_runs
-from experiments.bench.counts import Work
 from experiments.bench.subject import (
     SEED,
     Subject,
@@ -30,6 +27,7 @@ from experiments.bench.subject import (
     draw_training_pixels,
     pixel_centres,
 )
+from experiments.bench.timing import Ceilings, Work, timed, timed_runs
 from experiments.build import RENDER_CHUNK
 from experiments.build_trainer import Trainer
 from experiments.keys import run_key, stream_key

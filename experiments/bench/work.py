@@ -31,8 +31,8 @@ from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.channel import make_uncertainty_channel
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 from bavs_jax.uncertainty.model import RECONSTRUCTION
-from experiments.bench.counts import Work, compiled_work
 from experiments.bench.subject import SEED, Subject, changed
+from experiments.bench.timing import Work, compiled_work
 from experiments.build_trainer import build_trainer
 from experiments.keys import run_key
 

@@ -8,13 +8,15 @@ from functools import partial
 
 import numpy as np
 
-from bavs_jax.export.cloud import ray_end_points
-from bavs_jax.export.extras import import_extra
-from bavs_jax.export.geometry import DISTANCE_SHARE, geometry_error, sample_mesh
-from bavs_jax.export.grid import sample_grid
+from bavs_jax.export.field import (
+    DISTANCE_SHARE,
+    geometry_error,
+    ray_end_points,
+    sample_grid,
+    sample_mesh,
+)
+from bavs_jax.export.formats import import_extra, nrrd_bytes, ply_bytes
 from bavs_jax.export.mesh import extract_mesh, without_small_parts
-from bavs_jax.export.ply import ply_bytes
-from bavs_jax.export.volume import nrrd_bytes
 from bavs_jax.fields.deformation import offset_unit
 from bavs_jax.scenes import Scene
 from bavs_jax.scenes.poses import user_points, user_units

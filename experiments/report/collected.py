@@ -7,10 +7,10 @@ import pathlib
 from collections.abc import Sequence
 
 from experiments.report.formats import FORMATS, latex_text
-from experiments.report.over_scenes import mean_runs
 from experiments.report.paper_table import paper_table
 from experiments.report.results import ReportError, Run, load_runs, load_runs_of
 from experiments.report.settings_table import Setting, settings_table
+from experiments.report.stats import mean_runs
 from experiments.report.tables import (
     Table,
     baseline_table,

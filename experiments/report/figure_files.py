@@ -1,16 +1,19 @@
-"""Figures of an experiment as files of their own."""
+"""Figures as files: curves, test views, and stacks of pictures."""
 
 from __future__ import annotations
 
 import pathlib
 from collections.abc import Sequence
 
-from experiments.report import gaps, stats
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.report import plots, stats
 from experiments.report.headline import focus_policy
-from experiments.report.panels import save_figure
+from experiments.report.panels import Panel, panel_table, save_figure
+from experiments.report.pictures import UNCERTAINTY_MAP, psnr_words, uncertainty_limits
 from experiments.report.plots import quality_figure
-from experiments.report.results import Run, load_pictures, load_runs_of
-from experiments.report.views_figure import views_figure
+from experiments.report.results import ReportError, Run, load_pictures, load_runs_of
 
 FORMATS = ("pdf", "png", "svg")
 
@@ -34,7 +37,7 @@ def write_figures(
     """
     runs = load_runs_of(workdir, policies)
     shown = list(dict.fromkeys(run.policy for run in runs))
-    coloured = gaps.in_colour(runs, shown, focus_policy(shown))
+    coloured = plots.in_colour(runs, shown, focus_policy(shown))
     figures = {m.key: quality_figure(runs, shown, m, coloured) for m in stats.MEASURES}
     for figure in filter(None, figures.values()):
         # A page says this beside the figure; a file has to say it itself.
@@ -60,3 +63,41 @@ def _pictures(runs: list[Run], policies: list[str]) -> dict:
             kept.setdefault(run.seed, {})[run.policy] = pictures
     best = max(kept.values(), key=len, default={})  # the first of the largest
     return {policy: best[policy] for policy in policies if policy in best}
+
+
+def views_figure(pictures: dict[str, dict[str, np.ndarray]], num_views: int) -> Figure:
+    """A row for each test view: the truth, then each policy's render and rendered uncertainty.
+
+    Args:
+      pictures: of each policy, what its run left in `pictures.npz`.
+      num_views: most rows, of the views that all of them show.
+
+    Raises:
+      ReportError: there is no such view.
+    """
+    first = next(iter(pictures.values()))
+    shared = set.intersection(*(set(arrays["view_ids"].tolist()) for arrays in pictures.values()))
+    if not shared:
+        raise ReportError(f"{', '.join(pictures)}: show no test view in common; name one policy")
+    limits = uncertainty_limits([*pictures.values()])
+    rows = []
+    for view_id in [v for v in first["view_ids"] if int(v) in shared][:num_views]:
+        rows.append(_row(view_id, pictures, first, limits))
+    return panel_table(rows, scale_label="uncertainty (in [0, 1])")
+
+
+def _row(view_id: int, pictures, first, limits) -> tuple[str, list[Panel]]:
+    at = _index(first, view_id)
+    panels = [Panel("truth", first["truth"][at] / 255.0)]
+    for policy, arrays in pictures.items():
+        i = _index(arrays, view_id)
+        quality = psnr_words(arrays["rgb"][i], arrays["truth"][i])
+        panels += [
+            Panel(f"{policy}, {quality}", arrays["rgb"][i] / 255.0),
+            Panel(f"{policy}, uncertainty", arrays["uncertainty"][i], UNCERTAINTY_MAP, limits),
+        ]
+    return pathlib.PurePath(str(first["names"][at])).stem, panels
+
+
+def _index(arrays: dict[str, np.ndarray], view_id: int) -> int:
+    return int(np.flatnonzero(arrays["view_ids"] == view_id)[0])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from experiments.report import camera_map, choices, gaps, pictures, plots, stats, tables
+from experiments.report import camera_map, choices, pictures, plots, stats, tables
 from experiments.report.headline import focus_policy, make_headline
 from experiments.report.results import Run, load_acquisition, load_pictures, load_runs
 from experiments.web.page import write_template
@@ -41,9 +41,9 @@ def page_content(runs: list[Run]) -> dict:
     """Everything that the template names."""
     policies = _ordered_policies(runs)
     picture_sections, bars = _picture_sections(runs, policies)
-    coloured = gaps.in_colour(runs, policies, focus_policy(policies))
+    coloured = plots.in_colour(runs, policies, focus_policy(policies))
     qualities = [plots.quality_plot(runs, policies, m, coloured) for m in stats.MEASURES]
-    gap_svg = gaps.gap_plot(runs, policies, coloured)
+    gap_svg = plots.gap_plot(runs, policies, coloured)
     timing = plots.timing_plot(runs, policies)
     return {
         "title": runs[0].result["scene"]["name"] if runs else "no runs",

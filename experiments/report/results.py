@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from experiments.errors import ReportError
-from experiments.files import load_arrays
+from experiments.files import load_arrays, read_versioned
 from experiments.picture_stack import cut_pictures
-from experiments.versioned import read_versioned
 
 SCHEMA_VERSION = 1
 PICTURE_KEYS = ("view_ids", "names", "truth", "rgb", "error", "uncertainty", "round")

@@ -11,12 +11,11 @@ import numpy as np
 from bavs_jax.cameras import Cameras, hemisphere_poses, take
 from bavs_jax.placement.clearance import judge_positions, matter_density, within_bounds
 from bavs_jax.placement.collect import check_enough, collect_poses
-from bavs_jax.placement.focus import focus_point, share_facing
 from bavs_jax.placement.proposals import aim, box_positions, shell_positions, turned_targets
-from bavs_jax.placement.seen import in_unknown_space
+from bavs_jax.placement.seen import focus_point, in_unknown_space, share_facing
 from bavs_jax.scenes import Scene
-from bavs_jax.scenes.normalise import transform_poses
 from bavs_jax.scenes.pose_files import read_pose_file
+from bavs_jax.scenes.poses import transform_poses
 from experiments.keys import stream_key
 from experiments.suggest.settings import Options
 

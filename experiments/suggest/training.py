@@ -12,8 +12,7 @@ import numpy as np
 from bavs_jax.active import init_active_state, round_keys
 from bavs_jax.scenes import Scene, SceneError
 from bavs_jax.training.checkpoints import Checkpoints
-from bavs_jax.training.fit import fit
-from bavs_jax.training.health import check_call
+from bavs_jax.training.fit import check_call, fit
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import Situation
 from bavs_jax.uncertainty.models.laplace import training_curvature

@@ -9,7 +9,7 @@ import os
 import pathlib
 
 from experiments.errors import ConfigError
-from experiments.sweeps.process import end_process, open_process
+from experiments.sweeps.local import end_process, open_process
 from experiments.sweeps.schedule import Ended, Job
 
 

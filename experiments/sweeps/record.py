@@ -7,8 +7,7 @@ import pathlib
 from typing import Any
 
 from experiments.errors import WorkdirError
-from experiments.files import write_json
-from experiments.versioned import read_versioned
+from experiments.files import read_versioned, write_json
 
 SCHEMA_VERSION = 1
 FILE = "sweep.json"

@@ -7,10 +7,10 @@ import pathlib
 
 from experiments import workdir
 from experiments.progress import track
+from experiments.sweeps.local import StepCounter
 from experiments.sweeps.plan import Trial, num_steps
 from experiments.sweeps.record import Record, write_record
 from experiments.sweeps.schedule import Engine, run_jobs
-from experiments.sweeps.steps import StepCounter
 
 
 def run_trials(

@@ -19,8 +19,7 @@ from bavs_jax.uncertainty.bands import (
     render_errors,
 )
 from bavs_jax.uncertainty.conformal_report import coverage_report, to_json
-from bavs_jax.uncertainty.conformal_scale import ViewErrors
-from bavs_jax.uncertainty.conformal_split import ViewGroups, split_views
+from bavs_jax.uncertainty.conformal_scale import ViewErrors, ViewGroups, split_views
 from experiments.build import RENDER_CHUNK
 from experiments.errors import ConfigError
 from experiments.evaluate import spread_evenly

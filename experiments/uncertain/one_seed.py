@@ -19,9 +19,8 @@ from experiments.keys import stream_key
 from experiments.machine import code_commit
 from experiments.trained import FIRST_ROUND, train_run
 from experiments.uncertain import intervals, measure
-from experiments.uncertain.band_picture import band_arrays
-from experiments.uncertain.calibration_file import calibration_path, save_calibration
-from experiments.uncertain.image_file import load_images, save_images
+from experiments.uncertain.files import calibration_path, load_images, save_calibration, save_images
+from experiments.uncertain.plots import band_arrays
 from experiments.uncertain.results import ROW_VERSION, row_path
 
 COMMON_MODEL = "entropy"  # fits nothing: what it renders is the run's own field

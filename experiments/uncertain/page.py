@@ -9,9 +9,15 @@ from markupsafe import Markup
 
 from experiments.picture_stack import cut_pictures
 from experiments.report.pictures import ERROR_MAP, UNCERTAINTY_MAP, colourise, png_uri, shrink
-from experiments.uncertain.band_picture import LEVEL, band_strip, scanline_plot
-from experiments.uncertain.coverage_plots import coverage_plot, decile_plot, width_plot
-from experiments.uncertain.plots import curve_plot
+from experiments.uncertain.plots import (
+    LEVEL,
+    band_strip,
+    coverage_plot,
+    curve_plot,
+    decile_plot,
+    scanline_plot,
+    width_plot,
+)
 from experiments.uncertain.results import (
     FIELDS,
     known_quantities,

@@ -7,9 +7,8 @@ import pathlib
 
 import numpy as np
 
-from experiments.files import write_atomic
+from experiments.files import read_versioned, write_atomic
 from experiments.report import ReportError
-from experiments.versioned import read_versioned
 
 SCHEMA_VERSION = 2  # of uncertainty.json
 ROW_VERSION = 2  # of one model and seed; rows of another version are made anew

@@ -7,13 +7,7 @@ import numpy as np
 from bavs_jax.metrics.ause import variant_name
 from experiments.report import stats
 from experiments.report.tables import Cell, Table, dash, interval_cell
-from experiments.uncertain.results import (
-    FIELDS,
-    QUANTITIES,
-    interval_values,
-    models_of,
-    values,
-)
+from experiments.uncertain.results import FIELDS, QUANTITIES, interval_values, models_of, values
 
 CONSTANT = "constant width"  # the intervals that need no uncertainty
 SUMMARY = {of: variant_name(of=of, error="mae", pooled=False) for of in ("depth", "colour")}

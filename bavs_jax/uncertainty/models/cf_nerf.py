@@ -9,7 +9,7 @@ import jax
 from bavs_jax.devices import jit_over_rays
 from bavs_jax.fields.flow_field import base_draws
 from bavs_jax.rendering.pixels import basic_images, render_pixels
-from bavs_jax.uncertainty.disagreement import colour_variance
+from bavs_jax.uncertainty.measures import colour_variance
 from bavs_jax.uncertainty.model import FLOW, ModelFns, Toolbox, UncertaintyModel
 
 DRAWS_SEED = 0  # the same draws for every image of every run

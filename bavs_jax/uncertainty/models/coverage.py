@@ -13,8 +13,8 @@ from bavs_jax.cameras import Cameras
 from bavs_jax.devices import jit_over_rays
 from bavs_jax.rendering.pixels import basic_images, render_pixels
 from bavs_jax.rendering.render import Channel
-from bavs_jax.uncertainty.coverage import direction_novelty
 from bavs_jax.uncertainty.images import make_image_fn, render_stack
+from bavs_jax.uncertainty.measures import direction_novelty
 from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from bavs_jax.uncertainty.disagreement import ensemble_uncertainty
 from bavs_jax.uncertainty.images import make_image_fn
+from bavs_jax.uncertainty.measures import ensemble_uncertainty
 from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from bavs_jax.uncertainty.entropy import ray_entropy
 from bavs_jax.uncertainty.images import make_image_fn
+from bavs_jax.uncertainty.measures import ray_entropy
 from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
 
 

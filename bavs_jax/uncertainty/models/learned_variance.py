@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from bavs_jax.rendering.compositing import rendered_variance
-from bavs_jax.uncertainty.active_gain import variance_reduction
 from bavs_jax.uncertainty.images import make_image_fn
+from bavs_jax.uncertainty.measures import variance_reduction
 from bavs_jax.uncertainty.model import VARIANCE, ModelFns, Toolbox, UncertaintyModel
 
 

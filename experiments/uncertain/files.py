@@ -1,17 +1,14 @@
-"""Calibrated intervals in a file, for other scripts and new views of the same field."""
+"""Files beside a result: calibrations that can be put around new renders, and images."""
 
 from __future__ import annotations
 
 import pathlib
 
-from bavs_jax.uncertainty.bands import (
-    RenderCalibration,
-    calibration_from_json,
-    calibration_to_json,
-)
+import numpy as np
+
+from bavs_jax.uncertainty.bands import RenderCalibration, calibration_from_json, calibration_to_json
 from experiments.errors import WorkdirError
-from experiments.files import write_json
-from experiments.versioned import read_versioned
+from experiments.files import read_arrays, read_versioned, write_arrays, write_json
 
 SCHEMA_VERSION = 1
 
@@ -50,3 +47,22 @@ def load_calibration(path: pathlib.Path) -> RenderCalibration:
         return calibration_from_json(values.get("calibration") or {})
     except ValueError as error:
         raise WorkdirError(f"{path}: {error}") from None
+
+
+def save_images(path: pathlib.Path, images: list[dict[str, np.ndarray]], seconds: float) -> None:
+    """Writes the images of each view, whatever their sizes, and how long they took."""
+    arrays = {f"{i}/{name}": x for i, image in enumerate(images) for name, x in image.items()}
+    write_arrays(path, **arrays, seconds=np.float64(seconds))
+
+
+def load_images(path: pathlib.Path) -> tuple[list[dict[str, np.ndarray]], float] | None:
+    """The inverse of `save_images`; None where there is no file or a damaged one."""
+    arrays = read_arrays(path, "seconds")
+    if arrays is None:
+        return None
+    seconds = float(arrays.pop("seconds"))
+    images = [{} for _ in {key.split("/")[0] for key in arrays}]
+    for key, values in arrays.items():
+        number, name = key.split("/")
+        images[int(number)][name] = values
+    return images, seconds
