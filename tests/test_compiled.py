@@ -231,6 +231,7 @@ TOLERANCES = {"normals": 2e-3, "shade": 5e-3}
 SLOW = (
     *("normals", "shade", "project to surface", "displace", "interpolate", "harmonics"),
     *("interpolate, contracted", "cone variance", "resample", "project, opencv"),
+    "look of one, opencv",
 )
 NAMES = [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in CASES]
 

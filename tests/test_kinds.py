@@ -57,8 +57,8 @@ def silent(total, description, unit):
 @pytest.mark.parametrize(
     "unbounded, field_kind, options",
     [
-        (False, "nerf_mlp", {}),
-        (False, "mip_mlp", {}),
+        pytest.param(False, "nerf_mlp", {}, marks=pytest.mark.slow),
+        pytest.param(False, "mip_mlp", {}, marks=pytest.mark.slow),
         (True, "hash_grid", {"field__appearance_features": 2}),
     ],
 )

@@ -103,9 +103,8 @@ def test_starting_a_finished_run_again_changes_nothing(finished):
     assert (folder / "bavs" / "seed_0" / "result.json").read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    "kill_at", [13, *(pytest.param(n, marks=pytest.mark.slow) for n in (9, 17))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kill_at", [9, 13, 17])
 def test_killed_run_goes_on_and_ends_like_the_undisturbed_one(finished, tmp_path, kill_at):
     """SIGKILL after a number of log lines, in different rounds; then the same command again."""
     flags = [f"--workdir={tmp_path}", *toy_flags(policies="('bavs',)")]

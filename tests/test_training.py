@@ -392,6 +392,7 @@ def test_training_is_deterministic(trainer):
     jax.tree.map(np.testing.assert_array_equal, *results)
 
 
+@pytest.mark.slow
 def test_streamed_curvature_equals_one_dense_call_for_any_bucket(trainer):
     scene, field, sampler, _, fresh = trainer
     table, state = make_pixel_table(scene), fresh()
