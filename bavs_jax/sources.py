@@ -247,8 +247,8 @@ def make_view_rays_fn(cameras: Cameras, image_scale: float, table: PixelTable | 
     def view_rays(indices):
         num_rays = small_rays[indices]
         views = np.repeat(indices, num_rays).astype(np.int32)
-        within = np.concatenate([np.arange(num, dtype=np.int32) for num in num_rays])
-        of_rays = {"rays": rays_through_pixels(small, views, within)}
+        pixel_ids = np.concatenate([np.arange(num, dtype=np.int32) for num in num_rays])
+        of_rays = {"rays": rays_through_pixels(small, views, pixel_ids)}
         if table is not None:
             of_rays["view_ids"] = views
             of_rays["ray_weight"] = _unmasked_shares(table, indices, np.asarray(small.sizes))

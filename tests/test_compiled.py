@@ -56,7 +56,7 @@ def rows() -> dict[str, np.ndarray]:
     }
     values = {name: array.astype(np.float32) for name, array in values.items()}
     values["view_ids"] = rng.integers(0, NUM_VIEWS, num).astype(np.int32)
-    values["within"] = rng.integers(0, 64 * 48, num).astype(np.int32)
+    values["pixel_ids"] = rng.integers(0, 64 * 48, num).astype(np.int32)
     return values
 
 
@@ -86,8 +86,8 @@ def look_of_one(cameras, pixels):
     return look(cameras, jnp.zeros(len(pixels), int), pixels)
 
 
-def look_by_number(cameras, within):
-    return view_pixel_rays(cameras, jnp.zeros(len(within), int), within).directions
+def look_by_number(cameras, pixel_ids):
+    return view_pixel_rays(cameras, jnp.zeros(len(pixel_ids), int), pixel_ids).directions
 
 
 def look_into_contracted_space(cameras, pixels):
@@ -193,7 +193,7 @@ CASES = {
     **{f"look of one, {lens}": (look_of_one, f"{lens} of 1", "pixels") for lens in DISTORTION},
     **{f"project, {lens}": (projected, f"{lens} of 1", "points") for lens in DISTORTION},
     "look": (look, "pinhole of 5", "view_ids", "pixels"),
-    "look by number": (look_by_number, "pinhole of 1", "within"),
+    "look by number": (look_by_number, "pinhole of 1", "pixel_ids"),
     "look into contracted space": (look_into_contracted_space, "pinhole of 1", "pixels"),
     "look with harmonics": (look_with_harmonics, "pinhole of 1", "pixels"),
     "look into the box": (look_into_box, "pinhole of 1", "pixels"),

@@ -248,22 +248,22 @@ def test_a_missing_library_is_named(monkeypatch):
 
 def test_cloud_holds_the_ends_of_rays_that_are_not_empty():
     table, num = make_pixel_table(toy_scene()), 10
-    within = np.arange(num, dtype=np.int32)
-    views = 4 * (within % 3)  # three sides of the ring
+    pixel_ids = np.arange(num, dtype=np.int32)
+    views = 4 * (pixel_ids % 3)  # three sides of the ring
 
     def render(rays):
         depth = jnp.linalg.norm(rays.origins, axis=-1)
         return {"rgb": 1.1 * rays.directions**2, "depth": depth, "opacity": rays.directions[:, 0]}
 
-    rays = view_pixel_rays(table.cameras, views, within)
+    rays = view_pixel_rays(table.cameras, views, pixel_ids)
     keep = np.asarray(rays.directions[:, 0] >= 0.2)
     assert 0 < keep.sum() < num
-    positions, rgb = ray_end_points(render, table, views, within, chunk=4, min_opacity=0.2)
+    positions, rgb = ray_end_points(render, table, views, pixel_ids, chunk=4, min_opacity=0.2)
     depth = np.linalg.norm(rays.origins, axis=-1, keepdims=True)
     expected = np.asarray(rays.origins) + depth * np.asarray(rays.directions)
     np.testing.assert_allclose(positions, expected[keep], rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(rgb, np.minimum(1.1 * rays.directions**2, 1.0)[keep], rtol=1e-5)
-    empty, _ = ray_end_points(render, table, views, within, chunk=4, min_opacity=2.0)
+    empty, _ = ray_end_points(render, table, views, pixel_ids, chunk=4, min_opacity=2.0)
     assert empty.shape == (0, 3)
 
 

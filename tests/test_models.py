@@ -115,10 +115,10 @@ def test_candidates_add_what_their_photos_would(trained):
     toolbox = problem.make_toolbox(silent)
     curvature = make_candidate_curvature_fn(toolbox, situation, situation.candidates, 1.0)
     num_rays = int(problem.scene.offsets[1])
-    within = np.arange(num_rays, dtype=np.int32)
+    pixel_ids = np.arange(num_rays, dtype=np.int32)
     for index, added in zip((3, 1), curvature(np.array([3, 1]))):
         views = np.full(num_rays, problem.scene.pool[index], np.int32)
-        rays = view_pixel_rays(situation.table.cameras, views, within)
+        rays = view_pixel_rays(situation.table.cameras, views, pixel_ids)
         jac_sq_sum = toolbox.curvature(situation.train, rays, None, weighting=WEIGHTING)
         expected = 2.0 / situation.num_rays * np.asarray(jac_sq_sum)
         assert expected.max() > 0

@@ -197,10 +197,10 @@ def test_rays_and_colours_belong_together(trainer):
     """The ray of a pixel numbered in row order points where the picture shows that colour."""
     scene = trainer[0]
     table = make_pixel_table(scene)
-    within = jnp.arange(64)
+    pixel_ids = jnp.arange(64)
     view = jnp.full(64, 5)
-    rays = view_pixel_rays(table.cameras, view, within)
-    colours = np.asarray(pixel_colours(table, view, within)).reshape(8, 8, 3)
+    rays = view_pixel_rays(table.cameras, view, pixel_ids)
+    colours = np.asarray(pixel_colours(table, view, pixel_ids)).reshape(8, 8, 3)
     np.testing.assert_allclose(colours, scene.image(5) / 255.0, atol=1e-6)
     along = -(rays.directions * rays.origins).sum(-1)
     closest = rays.origins + along[:, None] * rays.directions
@@ -214,9 +214,9 @@ def test_masked_pixels_have_no_weight():
     table = make_pixel_table(scene).replace(pixel_mask=jnp.asarray(keep))
     batch = sample_pixels(jax.random.key(0), table, jnp.ones(4, bool), 400)
     assert 120 < int(batch.ray_weight.sum()) < 280  # half of 400, many standard deviations wide
-    view_ids, within = training_pixels(table, np.ones(4, bool))
+    view_ids, pixel_ids = training_pixels(table, np.ones(4, bool))
     assert len(view_ids) == keep.sum()
-    assert (keep[scene.offsets[view_ids] + within]).all()
+    assert (keep[scene.offsets[view_ids] + pixel_ids]).all()
 
 
 def test_random_background_shows_the_same_photos_over_other_colours():
@@ -403,10 +403,10 @@ def test_streamed_curvature_equals_one_dense_call_for_any_bucket(trainer):
         lambda x: x + 0.3 * jax.random.normal(jax.random.key(2), x.shape), state.params
     )
     grid = DeformationGrid(jnp.asarray(scene.box), 3)
-    view_ids, within = training_pixels(table, np.arange(scene.num_views) < 2)
-    pixels = table_rays(table, view_ids, within, "eq13")
+    view_ids, pixel_ids = training_pixels(table, np.arange(scene.num_views) < 2)
+    pixels = table_rays(table, view_ids, pixel_ids, "eq13")
     background = jnp.asarray(scene.background)
-    rays = view_pixel_rays(table.cameras, jnp.asarray(view_ids), jnp.asarray(within))
+    rays = view_pixel_rays(table.cameras, jnp.asarray(view_ids), jnp.asarray(pixel_ids))
 
     @jax.jit
     def dense():

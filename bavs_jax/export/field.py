@@ -74,7 +74,7 @@ def ray_end_points(
     render_fn: Callable,
     table: PixelTable,
     view_ids,
-    within,
+    pixel_ids,
     *,
     chunk: int,
     min_opacity: float = MIN_OPACITY,
@@ -85,7 +85,7 @@ def ray_end_points(
     Args:
       render_fn: `Rays` [chunk] -> dict with "rgb" [chunk, 3], "depth" and "opacity" [chunk].
       table: the scene's pixels.
-      view_ids, within: [N] views and numbers of the pixels (`batches.training_pixels`).
+      view_ids, pixel_ids: [N] views and numbers of the pixels (`batches.training_pixels`).
       chunk: rays of one call.
       min_opacity: of the rays that count, in [0, 1]; below it a ray mostly passes.
       progress_fn: called with the number of rays done.
@@ -98,7 +98,7 @@ def ray_end_points(
     num = len(view_ids)
     for start in range(0, num, chunk):
         rows = np.minimum(np.arange(start, start + chunk), num - 1)
-        rays = _pixel_rays(table.cameras, view_ids[rows], within[rows])
+        rays = _pixel_rays(table.cameras, view_ids[rows], pixel_ids[rows])
         images = {name: np.asarray(x) for name, x in render_fn(rays).items()}
         counts = (np.arange(chunk) < num - start) & (images["opacity"] >= min_opacity)
         ends = np.asarray(rays.origins) + images["depth"][:, None] * np.asarray(rays.directions)

@@ -91,5 +91,5 @@ def distortion_loss(edges: jax.Array, weights: jax.Array) -> jax.Array:
     middles = 0.5 * (edges[..., :-1] + edges[..., 1:])
     distance = jnp.abs(middles[..., :, None] - middles[..., None, :])
     between = (weights[..., None] * weights[..., None, :] * distance).sum((-1, -2))
-    within = (jnp.square(weights) * jnp.diff(edges, axis=-1)).sum(-1)
-    return between + within / 3.0
+    pixel_ids = (jnp.square(weights) * jnp.diff(edges, axis=-1)).sum(-1)
+    return between + pixel_ids / 3.0

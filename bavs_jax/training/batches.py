@@ -94,32 +94,32 @@ def sample_pixels(
     ends = jnp.cumsum(sizes)
     number = jax.random.randint(key, (num_rays,), 0, ends[-1])
     view_ids = jnp.searchsorted(ends, number, side="right")
-    within = number - (ends - sizes)[view_ids]
-    rays = view_pixel_rays(table.cameras, view_ids, within)
+    pixel_ids = number - (ends - sizes)[view_ids]
+    rays = view_pixel_rays(table.cameras, view_ids, pixel_ids)
     if table.pixel_mask.shape[0] == 1:
         weight = jnp.ones(num_rays)
     else:
-        weight = table.pixel_mask[table.offsets[view_ids] + within].astype(jnp.float32)
-    rgb = pixel_colours(table, view_ids, within)
+        weight = table.pixel_mask[table.offsets[view_ids] + pixel_ids].astype(jnp.float32)
+    rgb = pixel_colours(table, view_ids, pixel_ids)
     if background is not None:
         background = jnp.broadcast_to(jnp.asarray(background, jnp.float32), rgb.shape)
     if random_background and background is not None and table.alpha.shape[0] > 1:
-        seen_through = 1.0 - table.alpha[table.offsets[view_ids] + within] / 255.0
+        seen_through = 1.0 - table.alpha[table.offsets[view_ids] + pixel_ids] / 255.0
         drawn = jax.random.uniform(jax.random.fold_in(key, 1), rgb.shape)
         rgb = rgb + seen_through[:, None] * (drawn - background)
         background = drawn
     return PixelBatch(rays, rgb, weight, view_ids, background)
 
 
-def pixel_colours(table: PixelTable, view_ids: jax.Array, within: jax.Array) -> jax.Array:
-    """True colours [R, 3] in [0, 1] of the pixels numbered `within` of the views `view_ids`."""
-    return table.pixels[table.offsets[view_ids] + within].astype(jnp.float32) / 255.0
+def pixel_colours(table: PixelTable, view_ids: jax.Array, pixel_ids: jax.Array) -> jax.Array:
+    """True colours [R, 3] in [0, 1] of the pixels numbered `pixel_ids` of the views `view_ids`."""
+    return table.pixels[table.offsets[view_ids] + pixel_ids].astype(jnp.float32) / 255.0
 
 
-def view_pixel_rays(cameras: Cameras, view_ids: jax.Array, within: jax.Array) -> Rays:
-    """Rays through the pixels numbered `within` (row order) of the views `view_ids`, both [R]."""
+def view_pixel_rays(cameras: Cameras, view_ids: jax.Array, pixel_ids: jax.Array) -> Rays:
+    """Rays through pixels, numbered in row order, of the views `view_ids`; both [R]."""
     width = cameras.sizes[view_ids, 0]
-    pixels = jnp.stack([within % width, within // width], axis=-1) + 0.5
+    pixels = jnp.stack([pixel_ids % width, pixel_ids // width], axis=-1) + 0.5
     return pixel_rays(cameras, view_ids, pixels)
 
 
@@ -128,9 +128,9 @@ def training_pixels(table: PixelTable, is_training_view) -> tuple[np.ndarray, np
     offsets, mask = np.asarray(table.offsets), np.asarray(table.pixel_mask)
     views = np.flatnonzero(is_training_view)
     view_ids = np.repeat(views, np.diff(offsets)[views]).astype(np.int32)
-    within = np.concatenate([np.arange(offsets[v + 1] - offsets[v]) for v in views])
-    within = within.astype(np.int32)
+    pixel_ids = np.concatenate([np.arange(offsets[v + 1] - offsets[v]) for v in views])
+    pixel_ids = pixel_ids.astype(np.int32)
     if len(mask) > 1:
-        keep = mask[offsets[view_ids] + within]
-        view_ids, within = view_ids[keep], within[keep]
-    return view_ids, within
+        keep = mask[offsets[view_ids] + pixel_ids]
+        view_ids, pixel_ids = view_ids[keep], pixel_ids[keep]
+    return view_ids, pixel_ids

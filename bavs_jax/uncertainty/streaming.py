@@ -25,28 +25,28 @@ RAY_CHUNK = 8192  # rays of one compiled call that makes them, or counts their s
 MAX_GROUP, MAX_GROUP_BYTES = 8, 2**26
 
 
-def table_rays(table: PixelTable, view_ids, within, weighting: str) -> dict:
+def table_rays(table: PixelTable, view_ids, pixel_ids, weighting: str) -> dict:
     """Pixels [N] of views that are trained on, as keywords of `make_curvature_fn`'s `curvature`.
 
     Args:
       table: the scene's pixels.
-      view_ids, within: [N] int, from `training_pixels`.
+      view_ids, pixel_ids: [N] int, from `training_pixels`.
       weighting: one of `curvature.WEIGHTINGS`; true colours are read where it needs them.
     """
     targets = None
     if weighting != "eq13":
-        rows = np.asarray(table.offsets)[view_ids] + within
+        rows = np.asarray(table.offsets)[view_ids] + pixel_ids
         targets = np.asarray(table.pixels)[rows].astype(np.float32) / np.float32(255.0)
-    rays = rays_through_pixels(table.cameras, view_ids, within)
+    rays = rays_through_pixels(table.cameras, view_ids, pixel_ids)
     return {"rays": rays, "targets": targets, "view_ids": view_ids}
 
 
-def rays_through_pixels(cameras: Cameras, view_ids, within) -> Rays:
+def rays_through_pixels(cameras: Cameras, view_ids, pixel_ids) -> Rays:
     """`view_pixel_rays` of any number of pixels [N] on the host, made in compiled chunks."""
     cameras = jax.tree.map(np.asarray, cameras)
     # Converted at the end, so that no chunk waits for the one before.
     parts = [
-        (_view_pixel_rays(cameras, view_ids[rows], within[rows]), num)
+        (_view_pixel_rays(cameras, view_ids[rows], pixel_ids[rows]), num)
         for rows, num in _chunks(np.arange(len(view_ids)), RAY_CHUNK)
     ]
     return Rays(

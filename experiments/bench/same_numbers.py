@@ -91,11 +91,14 @@ def numbers_on(
             trained = jax.tree.map(np.asarray, state)
         state = jax.device_put(trained, device)
 
-        view_ids, within = training_pixels(table, is_training)
+        view_ids, pixel_ids = training_pixels(table, is_training)
         toolbox = problem.make_toolbox(track)
         weighting = toolbox.laplace.weighting
         jac_sq_sum = toolbox.curvature(
-            state, label=None, weighting=weighting, **table_rays(table, view_ids, within, weighting)
+            state,
+            label=None,
+            weighting=weighting,
+            **table_rays(table, view_ids, pixel_ids, weighting),
         )
         image = render_views(
             problem.render(state), scene.cameras, scene.test[:1], chunk=RENDER_CHUNK

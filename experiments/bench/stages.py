@@ -146,8 +146,8 @@ def measure_training(subject: Subject, state: TrainState, sizes, compile_seconds
 def make_rendering_run(subject: Subject, state: TrainState, num_rays: int) -> Callable:
     """Makes `run() -> images` of so many training pixels."""
     cameras = subject.problem.table.cameras
-    view_ids, within = draw_training_pixels(subject, num_rays)
-    pixels, chunk_fn = pixel_centres(cameras, view_ids, within), subject.problem.render(state)
+    view_ids, pixel_ids = draw_training_pixels(subject, num_rays)
+    pixels, chunk_fn = pixel_centres(cameras, view_ids, pixel_ids), subject.problem.render(state)
     return lambda: render_pixels(chunk_fn, cameras, view_ids, pixels, chunk=RENDER_CHUNK)
 
 
@@ -206,8 +206,8 @@ def measure_scoring(subject: Subject, state: TrainState, jac_sq_sum, sizes) -> S
     total = int(num_pixels(cameras).sum())
     rng = np.random.default_rng(SEED)
     view_ids = rng.integers(0, len(cameras), RENDER_CHUNK)
-    within = rng.integers(0, num_pixels(cameras)[view_ids])
-    rays = jax.jit(view_pixel_rays)(jax.tree.map(np.asarray, cameras), view_ids, within)
+    pixel_ids = rng.integers(0, num_pixels(cameras)[view_ids])
+    rays = jax.jit(view_pixel_rays)(jax.tree.map(np.asarray, cameras), view_ids, pixel_ids)
     num_samples = max(int(subject.count_samples(state, rays).sum()), 1)
     variance = laplace_variance(jac_sq_sum, num_rays, options)
     chunk = work.rendering_work(subject, state, rays, num_samples, variance)

@@ -122,15 +122,15 @@ def train_field(subject: Subject) -> TrainState:
 
 def draw_training_pixels(subject: Subject, num: int) -> tuple[np.ndarray, np.ndarray]:
     """View ids and row numbers [num] of pixels, uniform over those that are trained on."""
-    view_ids, within = training_pixels(subject.problem.table, subject.is_training_view)
+    view_ids, pixel_ids = training_pixels(subject.problem.table, subject.is_training_view)
     rows = np.random.default_rng(SEED).integers(0, len(view_ids), num)
-    return view_ids[rows], within[rows]
+    return view_ids[rows], pixel_ids[rows]
 
 
-def pixel_centres(cameras: Cameras, view_ids: np.ndarray, within: np.ndarray) -> np.ndarray:
+def pixel_centres(cameras: Cameras, view_ids: np.ndarray, pixel_ids: np.ndarray) -> np.ndarray:
     """Pixel coordinates [num, 2] of row numbers."""
     width = np.asarray(cameras.sizes)[view_ids, 0]
-    return np.stack([within % width, within // width], axis=-1).astype(np.float32) + 0.5
+    return np.stack([pixel_ids % width, pixel_ids // width], axis=-1).astype(np.float32) + 0.5
 
 
 def draw_candidates(subject: Subject, num: int, width: int) -> Cameras:

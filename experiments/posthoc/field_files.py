@@ -98,16 +98,16 @@ def write_points(
 ) -> dict[str, pathlib.Path]:
     """`points.ply`: where training rays end, with rendered colour and uncertainty there."""
     scene, situation = run.problem.scene, run.situation
-    view_ids, within = training_pixels(situation.table, situation.is_training_view)
+    view_ids, pixel_ids = training_pixels(situation.table, situation.is_training_view)
     if max_points and len(view_ids) > max_points:
         rows = np.random.default_rng(run.seed).permutation(len(view_ids))[:max_points]
-        view_ids, within = (x[np.sort(rows)] for x in (view_ids, within))
+        view_ids, pixel_ids = (x[np.sort(rows)] for x in (view_ids, pixel_ids))
     with track(len(view_ids), "follow training rays", "rays") as bar:
         positions, rgb = ray_end_points(
             run.problem.render(situation.train),
             situation.table,
             view_ids,
-            within,
+            pixel_ids,
             chunk=RENDER_CHUNK,
             min_opacity=min_opacity,
             progress_fn=bar.advance,

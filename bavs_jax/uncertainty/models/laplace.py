@@ -21,18 +21,18 @@ from bavs_jax.uncertainty.streaming import table_rays
 
 def training_curvature(key, toolbox: Toolbox, situation: Situation, weighting: str) -> jax.Array:
     """`jac_sq_sum` [G, 3] over all training rays, or over a uniform subset that stands for them."""
-    view_ids, within = training_pixels(situation.table, situation.is_training_view)
+    view_ids, pixel_ids = training_pixels(situation.table, situation.is_training_view)
     most, scale = toolbox.laplace.max_rays, 1.0
     if most is not None and len(view_ids) > most:
         seed = int(jax.random.randint(key, (), 0, 2**31 - 1))
         rows = np.sort(np.random.default_rng(seed).permutation(len(view_ids))[:most])
         scale = len(view_ids) / most
-        view_ids, within = view_ids[rows], within[rows]
+        view_ids, pixel_ids = view_ids[rows], pixel_ids[rows]
     return scale * toolbox.curvature(
         situation.train,
         label=f"{situation.label}: curvature",
         weighting=weighting,
-        **table_rays(situation.table, view_ids, within, weighting),
+        **table_rays(situation.table, view_ids, pixel_ids, weighting),
     )
 
 
