@@ -125,7 +125,10 @@ def make_active_step(
         propose_key, source_key, policy_key = jax.random.split(key, 3)
         candidates = source.propose(propose_key, state.table, state.is_training_view)
         situation = Situation(
-            *(state.train, state.table, state.is_training_view, num_rays),
+            state.train,
+            state.table,
+            state.is_training_view,
+            num_rays,
             candidates=candidates.cameras,
             label=label,
         )
@@ -167,8 +170,12 @@ def make_active_step(
         _, _, train_key = round_keys(key, int(state.round))
         start = time.perf_counter()
         for fitted in fit(
-            *(train_key, stages.init, stages.train_call),
-            *(state.train, state.table, state.is_training_view),
+            train_key,
+            stages.init,
+            stages.train_call,
+            state.train,
+            state.table,
+            state.is_training_view,
             num_calls=calls_per_round,
             check_call=check_call,
             calls=int(state.calls),

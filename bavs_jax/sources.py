@@ -121,7 +121,10 @@ def make_sources_fn(
         curvature_fn = candidate_curvature(situation, candidates, seconds)
         with _clock(seconds, "curvature"):
             return directional_information(
-                *(toolbox, situation, candidates.cameras, curvature_fn),
+                toolbox,
+                situation,
+                candidates.cameras,
+                curvature_fn,
                 image_scale=options.image_scale,
                 max_bytes=options.cache_bytes,
             )

@@ -133,7 +133,9 @@ def build_problem(
             quiet = contextlib.nullcontext(None)
             with quiet if label is None else track(len(rays.origins), label, "rays") as task:
                 sums = curvature_fn(weighting)(
-                    *(state.params, state.sampler_state, rays),
+                    state.params,
+                    state.sampler_state,
+                    rays,
                     progress_fn=task and task.advance,
                     group_ids=group_ids,
                     num_groups=group_size,  # in both cases, so that they share compilations

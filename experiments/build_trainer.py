@@ -123,8 +123,12 @@ def train_aside(
     state = trainer.init(init_key)
     with track(num_calls * steps, f"{situation.label}: train {kind}", "steps") as bar:
         for fitted in fit(
-            *(steps_key, trainer.init, trainer.call),
-            *(state, situation.table, situation.is_training_view),
+            steps_key,
+            trainer.init,
+            trainer.call,
+            state,
+            situation.table,
+            situation.is_training_view,
             num_calls=num_calls,
             check_call=check_call(num_calls, steps),
             label=f"{kind} field",

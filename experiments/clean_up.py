@@ -77,7 +77,10 @@ def clean_run(run: TrainedRun) -> dict:
     test_views = spread_evenly(run.problem.scene.test, FLAGS.num_test)
     sweeps = {
         name: sweep_views(
-            *(cleaned, run, views, thresholds),
+            cleaned,
+            run,
+            views,
+            thresholds,
             min_opacity=FLAGS.min_opacity,
             label=f"{len(views)} {name} views",
         )

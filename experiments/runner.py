@@ -196,7 +196,10 @@ class Run:
         num_rays = int(num_training_pixels(self.problem.scene, self.initial).sum())
         fns = self.problem.model_fns("laplace", track)
         situation = Situation(
-            *(state.train, state.table, state.is_training_view, num_rays),
+            state.train,
+            state.table,
+            state.is_training_view,
+            num_rays,
             label=f"{self.label}: pictures",
         )
         fitted = fns.fit(stream_key(self.seed, "pictures"), situation)

@@ -44,7 +44,11 @@ def gradient(trained, sampler, objective, mesh, table, mask):
     """Of one step: what plain descent with a rate of 1 takes away; and the start's parameters."""
     optimiser = optax.sgd(1.0)
     train = make_train_fn(
-        *(trained, sampler, objective, optimiser, lambda step: 1.0),
+        trained,
+        sampler,
+        objective,
+        optimiser,
+        lambda step: 1.0,
         num_rays=NUM_RAYS,
         penalty_weight=0.1,
         steps_per_call=1,
@@ -109,7 +113,9 @@ def main(out):
         curvature, num_rays=100, prior_weight=1e-4, weighting="eq13", variant="posterior"
     )
     render_chunk = make_render_chunk_fn(
-        *(field, sampler, grid),
+        field,
+        sampler,
+        grid,
         **shared,
         background=scene.background,
         variant="posterior",

@@ -199,7 +199,11 @@ def test_training_that_is_picked_up_goes_the_same_way_and_a_bad_loss_ends_it():
     def trained(losses, **begin):
         init, call, _, keys = make_calls(losses)
         parts = fit(
-            *(jax.random.key(3), init, call, fresh(begin.get("restarts", 0)), *where),
+            jax.random.key(3),
+            init,
+            call,
+            fresh(begin.get("restarts", 0)),
+            *where,
             num_calls=CALLS,
             check_call=CHECK,
             label="toy",

@@ -120,7 +120,9 @@ class World:
         def curvature(state, rays, label, *, weighting, group_ids=None, **of_rays):
             del label, weighting
             sums = curvature_fn(
-                *(state.params, state.sampler_state, rays),
+                state.params,
+                state.sampler_state,
+                rays,
                 group_ids=group_ids,
                 num_groups=toolbox.group_size,
                 **of_rays,

@@ -266,7 +266,7 @@ def test_colours_and_their_gradients_change_by_less_than_the_light_that_is_left(
 
     def colours(scale, samples):
         return render_rays(
-            *(rays, samples, partial(field_fn, scale)), background=WHITE, capacity=4000, exact=False
+            rays, samples, partial(field_fn, scale), background=WHITE, capacity=4000, exact=False
         ).rgb
 
     np.testing.assert_allclose(colours(1.0, kept), colours(1.0, samples), atol=least)

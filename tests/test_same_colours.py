@@ -103,7 +103,7 @@ def test_the_predictive_images_are_those_of_the_renderer(unbounded, codes):
     want = jax.jit(
         lambda: basic_images(
             *render_pixels(
-                *(field, sampler, params, state, rays), background=background, capacity=CAPACITY
+                field, sampler, params, state, rays, background=background, capacity=CAPACITY
             )
         )
     )()
@@ -125,7 +125,9 @@ def test_the_residual_of_the_curvature_is_that_of_the_render(unbounded, codes):
     def rendered():
         samples, _ = sampler.sample(None, params["sampler"], state, rays)
         return render_rays(
-            *(rays, samples, partial(field.apply, params["field"])),
+            rays,
+            samples,
+            partial(field.apply, params["field"]),
             background=background,
             capacity=CAPACITY,
             exact=True,

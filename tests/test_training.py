@@ -135,7 +135,8 @@ def test_training_renders_the_mean_and_goes_on_from_the_last_parameters(trainer)
             field,
             sampler,
             make_colour_objective(field, capacity=1024),
-            *(optimiser, schedule),
+            optimiser,
+            schedule,
             num_rays=64,
             background=scene.background,
             average_age=age,
@@ -232,7 +233,10 @@ def test_random_background_shows_the_same_photos_over_other_colours():
     views = jnp.ones(4, bool)
     plain = sample_pixels(jax.random.key(0), table, views, 500, background=scene.background)
     drawn = sample_pixels(
-        *(jax.random.key(0), table, views, 500),
+        jax.random.key(0),
+        table,
+        views,
+        500,
         background=scene.background,
         random_background=True,
     )
@@ -366,7 +370,9 @@ def test_leaving_out_hidden_samples_trains_the_same_with_fewer_of_them(trainer):
     found = {}
     for looked_at in (0, 2048):
         train = make_train(
-            *((scene, thick, sampler), optax.sgd(1.0), lambda step: 1.0),
+            (scene, thick, sampler),
+            optax.sgd(1.0),
+            lambda step: 1.0,
             capacity=2048,
             capacity_before_hiding=looked_at,
         )

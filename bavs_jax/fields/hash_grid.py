@@ -160,7 +160,11 @@ def make_hash_grid_field(
 
     has_codes = appearance_features > 0
     return Field(
-        *(init, apply, density, penalty, inputs if has_codes else no_inputs),
+        init,
+        apply,
+        density,
+        penalty,
+        inputs if has_codes else no_inputs,
         reads_views=has_codes,
         roughness=lambda params: table_roughness(params["encoding"], module.resolutions),
     )

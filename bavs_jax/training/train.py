@@ -166,7 +166,10 @@ def make_train_fn(
     def loss_fn(params, key, sampler_state, table, is_training_view):
         pixel_key, sample_key, objective_key = jax.random.split(key, 3)
         batch = sample_pixels(
-            *(pixel_key, table, is_training_view, num_rays),
+            pixel_key,
+            table,
+            is_training_view,
+            num_rays,
             background=background,
             random_background=random_background,
         )

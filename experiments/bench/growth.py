@@ -65,17 +65,26 @@ def all_series(subject: Subject, state: TrainState, jac_sq_sum, num_rays: int, s
         Series("render_rays", "Rendering", "rays", growth.render_rays, rendering),
         Series("curvature_rays", "Curvature", "rays", growth.curvature_rays, curvature),
         Series(
-            *("curvature_grid", f"Curvature of {growth.grid_rays:,} rays"),
-            *("grid cells per side", cells, curvature_on),
+            "curvature_grid",
+            f"Curvature of {growth.grid_rays:,} rays",
+            "grid cells per side",
+            cells,
+            curvature_on,
         ),
         Series("score_candidates", "Scoring", "candidates", growth.candidates, scoring),
         Series(
-            *("select_candidates", f"Selecting a batch of {batch}", "candidates"),
-            *(growth.candidates, lambda n: selection(n, batch)),
+            "select_candidates",
+            f"Selecting a batch of {batch}",
+            "candidates",
+            growth.candidates,
+            lambda n: selection(n, batch),
         ),
         Series(
-            *("select_batch", f"Selecting among {num:,} candidates", "views of the batch"),
-            *(growth.batch_size, lambda k: selection(num, k)),
+            "select_batch",
+            f"Selecting among {num:,} candidates",
+            "views of the batch",
+            growth.batch_size,
+            lambda k: selection(num, k),
         ),
     ]
 

@@ -33,14 +33,16 @@ def growth_plot(name: str, row: dict) -> str:
         steps = np.geomspace(sizes[0], sizes[-1], 100)
         line = fit["intercept_s"] + fit["slope_s"] * steps
         axes.plot(
-            *(steps[line > 0], line[line > 0]),
+            steps[line > 0],
+            line[line > 0],
             color=plots.GREY,
             linewidth=1.2,
             linestyle="--",
             label=f"straight line, off by at most {fit['largest_deviation']:.0%}",
         )
         axes.plot(
-            *(steps, seconds[-1] * steps / sizes[-1]),
+            steps,
+            seconds[-1] * steps / sizes[-1],
             color=plots.PALE,
             linewidth=1.0,
             label="in proportion",
@@ -49,7 +51,8 @@ def growth_plot(name: str, row: dict) -> str:
     else:
         title = row["title"]
     axes.plot(
-        *(sizes, seconds),
+        sizes,
+        seconds,
         color=plots.BLUE,
         linestyle="none",
         marker="o",
@@ -86,7 +89,8 @@ def ceiling_plot(result: dict) -> str:
     ends = [*intensity.values(), top / slope]
     steps = np.geomspace(min(ends) / 3, max(ends) * 3, 100)
     axes.plot(
-        *(steps, np.minimum(top, slope * steps)),
+        steps,
+        np.minimum(top, slope * steps),
         color=plots.GREY,
         linewidth=1.5,
         label="copy, then matrix product",
@@ -94,7 +98,8 @@ def ceiling_plot(result: dict) -> str:
     for name in counted:
         title, (colour, marker) = STAGES[name], style[name]
         axes.plot(
-            *([intensity[name]], [stages[name]["flops_per_s"]]),
+            [intensity[name]],
+            [stages[name]["flops_per_s"]],
             color=colour,
             marker=marker,
             markersize=8,

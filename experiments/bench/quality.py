@@ -66,8 +66,12 @@ def measure_run(config, *, num_views: int, num_test_views: int, every: int, star
 
     with track(num_calls * steps, f"train on {num_views} views", "steps") as bar:
         for fitted in fit(
-            *(train_key, problem.init_train, problem.train_call),
-            *(train, problem.table, is_training),
+            train_key,
+            problem.init_train,
+            problem.train_call,
+            train,
+            problem.table,
+            is_training,
             num_calls=num_calls,
             check_call=check_call(num_calls, steps),
             label="train",

@@ -133,7 +133,11 @@ def measure_training(subject: Subject, state: TrainState, sizes, compile_seconds
     rays, samples = np.transpose(amounts)
     one_call = work.training_work(subject, state)
     stage = Stage(
-        *("train", "rays", rays.tolist(), seconds, compile_seconds),
+        "train",
+        "rays",
+        rays.tolist(),
+        seconds,
+        compile_seconds,
         one_call * sizes.train_calls,
         run,
     )
@@ -158,7 +162,11 @@ def measure_rendering(subject: Subject, state: TrainState, sizes) -> Stage:
     chunk = work.rendering_work(subject, state, rays, num_samples)
     run = make_rendering_run(subject, state, sizes.render_rays)
     return _measure(
-        *("render", "rays", sizes.render_rays, run, sizes.repeats),
+        "render",
+        "rays",
+        sizes.render_rays,
+        run,
+        sizes.repeats,
         chunk * (sizes.render_rays / RENDER_CHUNK),
     )
 
@@ -178,7 +186,11 @@ def measure_curvature(subject: Subject, state: TrainState, sizes) -> Stage:
     counts = np.asarray(subject.count_samples(state, rays))
     run = make_curvature_run(subject, state, sizes.curvature_rays)
     return _measure(
-        *("curvature", "rays", sizes.curvature_rays, run, sizes.repeats),
+        "curvature",
+        "rays",
+        sizes.curvature_rays,
+        run,
+        sizes.repeats,
         work.curvature_work(subject, state, rays, counts),
     )
 
@@ -213,7 +225,11 @@ def measure_scoring(subject: Subject, state: TrainState, jac_sq_sum, sizes) -> S
     chunk = work.rendering_work(subject, state, rays, num_samples, variance)
     run = make_scoring_run(subject, state, jac_sq_sum, num_rays, cameras)
     return _measure(
-        *("score", "candidates", sizes.candidates, run, sizes.repeats),
+        "score",
+        "candidates",
+        sizes.candidates,
+        run,
+        sizes.repeats,
         chunk * (total / RENDER_CHUNK),
     )
 
@@ -242,7 +258,11 @@ def measure_selection(subject: Subject, sizes) -> Stage:
     first, (_, info) = timed(run)
     seconds, _ = timed_runs(run, sizes.repeats)
     return Stage(
-        *("select", "batches", [1.0] * sizes.repeats, seconds, first - float(np.median(seconds))),
+        "select",
+        "batches",
+        [1.0] * sizes.repeats,
+        seconds,
+        first - float(np.median(seconds)),
         work.selection_work(ctx, info),
         run,
     )

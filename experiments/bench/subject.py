@@ -114,7 +114,7 @@ def make_subject(config, scene: Scene, num_views: int) -> Subject:
 def train_field(subject: Subject) -> TrainState:
     """The field at the end of its training."""
     situation = Situation(
-        *(None, subject.problem.table, subject.is_training_view, 0), label=subject.scene.name
+        None, subject.problem.table, subject.is_training_view, 0, label=subject.scene.name
     )
     key = run_key(SEED)
     return train_aside(subject.config, subject.trainer, key, situation, RECONSTRUCTION, track)

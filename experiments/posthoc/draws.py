@@ -99,14 +99,18 @@ def draw_views(
             moved = partial(displaced, train.params, train.sampler_state, theta)
             rendered = render_views(
                 lambda rays, fn=moved: {"rgb": fn(rays)["rgb"]},
-                *(cameras, view_ids),
+                cameras,
+                view_ids,
                 chunk=RENDER_CHUNK,
                 progress_fn=bar.advance,
             )
             by_draw.append([image["rgb"] for image in rendered])
     views = [
         ViewDraws(
-            *(int(v), image["rgb"], image["opacity"], image["uncertainty"]),
+            int(v),
+            image["rgb"],
+            image["opacity"],
+            image["uncertainty"],
             draws=np.stack([draw[i] for draw in by_draw]),
         )
         for i, (v, image) in enumerate(zip(view_ids, images))

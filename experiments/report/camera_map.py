@@ -118,7 +118,9 @@ def _draw_sky(axes: Axes, shown: np.ndarray) -> None:
         axes.add_patch(Circle((0, 0), radius, facecolor="none", zorder=0, **edge))
         name = "horizon" if elevation == 0 else f"{elevation}°"
         axes.text(
-            *(0, -radius, name),
+            0,
+            -radius,
+            name,
             fontsize=6.5,
             color="#8b93a1",
             ha="center",
@@ -194,7 +196,9 @@ def _draw_numbers(axes: Axes, points: np.ndarray, number: int, colour: str) -> N
     axes.scatter(*points.T, s=62, color="#e5e7eb", edgecolors=colour, linewidths=0.8, zorder=6)
     for x, y in points:
         axes.text(
-            *(x, y, str(number)),
+            x,
+            y,
+            str(number),
             fontsize=6.5,
             color=colour,
             ha="center",

@@ -121,7 +121,8 @@ def quality_figure(
                 high = [m + h for m, h in zip(means, halves)]
                 axes.fill_between(x, low, high, color=colour, alpha=0.14, linewidth=0, zorder=1)
             axes.plot(
-                *(x, means),
+                x,
+                means,
                 color=colour,
                 marker=marker,
                 markersize=5.5,
@@ -195,7 +196,8 @@ def timing_plot(runs: list[Run], policies: list[str]) -> str | None:
     for part, (label, colour) in PARTS.items():
         widths = [stats.mean_seconds(runs, policy, part) for policy in rows]
         axes.barh(
-            *(range(len(rows)), widths),
+            range(len(rows)),
+            widths,
             left=left,
             height=0.62,
             color=colour,

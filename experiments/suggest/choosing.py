@@ -81,7 +81,10 @@ def photo_situation(problem: Problem, train: TrainState, cameras: Cameras) -> Si
     is_training = np.zeros(len(problem.table.cameras), bool)
     is_training[problem.scene.pool] = True
     return Situation(
-        *(train, problem.table, is_training, photo_rays(problem)),
+        train,
+        problem.table,
+        is_training,
+        photo_rays(problem),
         candidates=cameras,
         label="candidates",
     )

@@ -123,7 +123,9 @@ def _draw_place(panel: Axes, flat, rows, photos, candidates, scores, selected, n
     )
     for number, (x, y) in enumerate(points, start=1):
         panel.text(
-            *(x, y, str(number)),
+            x,
+            y,
+            str(number),
             fontsize=8,
             fontweight="bold",
             color=plots.VERMILION,
@@ -180,12 +182,14 @@ def worth_plot(worth: Worth, photo_gain: float) -> str:
     num = len(worth.picked)
     curve = {"markersize": 5, "markeredgecolor": "white"}
     axes.plot(
-        *(np.arange(num + 1), worth.best_left / first),
+        np.arange(num + 1),
+        worth.best_left / first,
         **{**curve, "color": plots.BLUE, "marker": "o", "linewidth": 2.0},
         label="best candidate left after that many picks",
     )
     axes.plot(
-        *(np.arange(1, num + 1), worth.picked / first),
+        np.arange(1, num + 1),
+        worth.picked / first,
         **{**curve, "color": plots.VERMILION, "marker": "s", "linewidth": 1.2},
         label="each pick, after those before",
     )

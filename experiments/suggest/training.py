@@ -56,8 +56,12 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
         *_, key = round_keys(run_key(seed), 0)
         with track((num_calls - calls) * steps, f"train on {len(pool)} photos", "steps") as bar:
             for fitted in fit(
-                *(key, problem.init_train, problem.train_call),
-                *(train, problem.table, is_training),
+                key,
+                problem.init_train,
+                problem.train_call,
+                train,
+                problem.table,
+                is_training,
                 num_calls=num_calls,
                 check_call=check_call(num_calls, steps),
                 calls=calls,

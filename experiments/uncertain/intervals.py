@@ -104,7 +104,9 @@ def sample_views(scene, render_fn, view_ids, num: int, label: str) -> tuple[dict
     sizes = [len(chosen) for chosen in rows]
     with track(sum(sizes), f"{label}: pixels of {len(sizes)} views", "rays") as bar:
         images = render_pixels(
-            *(render_fn, scene.cameras, np.repeat(np.asarray(view_ids, np.int32), sizes)),
+            render_fn,
+            scene.cameras,
+            np.repeat(np.asarray(view_ids, np.int32), sizes),
             np.concatenate(pixels),
             chunk=RENDER_CHUNK,
             progress_fn=bar.advance,

@@ -56,7 +56,7 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
             rendered = measure.render_model(scene, fitted, view_ids, label)
         path = row_path(folder, name, seed)
         arrays, numbers = _sparsification(
-            *(config, scene, view_ids, rendered.images), errors_of(rendered.images), *about_common
+            config, scene, view_ids, rendered.images, errors_of(rendered.images), *about_common
         )
         more_arrays, more_numbers, seconds = _intervals(
             config, scene, fitted, situation, calibration_path(folder, name, seed), seed, label
@@ -118,7 +118,7 @@ def _intervals(config, scene, fitted, situation, path: pathlib.Path, seed: int, 
     options = config.evaluation
     groups = intervals.split(scene, situation.is_training_view, options.num_interval_views, seed)
     samples, seconds = intervals.sample_views(
-        *(scene, fitted.render, np.concatenate(groups), options.num_interval_pixels), label
+        scene, fitted.render, np.concatenate(groups), options.num_interval_pixels, label
     )
     calibration, numbers = intervals.calibrate_samples(
         groups, samples, scale=options.interval_scale, scale_depth=options.scale_depth

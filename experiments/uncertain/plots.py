@@ -30,7 +30,8 @@ def curve_plot(curves: dict[str, list[dict]], field: str, variant: str, title: s
         by_uncertainty, best = mean_curves(arrays, field, variant)
         colour, marker = style[model]
         axes.plot(
-            *(removal_fractions(len(by_uncertainty)), by_uncertainty),
+            removal_fractions(len(by_uncertainty)),
+            by_uncertainty,
             color=colour,
             linewidth=2.0,
             marker=marker,
@@ -76,7 +77,8 @@ def coverage_plot(rows: list[dict]) -> str:
                 for key in ("coverage", "coverage_stderr")
             )
             axes.errorbar(
-                *(x, 100.0 * (shares.mean(0) - levels)),
+                x,
+                100.0 * (shares.mean(0) - levels),
                 yerr=200.0 * np.nan_to_num(errors.mean(0)),
                 color=colour,
                 marker=marker,
@@ -105,7 +107,7 @@ def width_plot(rows: list[dict]) -> str:
             top = 1.0
             for model, colour, marker, x in _positions(rows, levels):
                 ratios = interval_values(rows, model, quantity, key)
-                axes.plot(*(x, ratios.mean(0)), marker, color=colour, markersize=6, label=model)
+                axes.plot(x, ratios.mean(0), marker, color=colour, markersize=6, label=model)
                 axes.vlines(x, ratios.min(0), ratios.max(0), color=colour, linewidth=1.4)
                 top = np.nanmax([top, *ratios.ravel()])
             axes.set_title(f"{quantity}: {words}", fontsize=10.5, loc="left")
@@ -128,7 +130,8 @@ def decile_plot(rows: list[dict], level: float) -> str:
         first = models_of(rows)[0]
         constant = interval_values(rows, first, quantity, "constant_decile_coverage")
         axes.plot(
-            *(tenths, 100.0 * constant.mean(0)[row]),
+            tenths,
+            100.0 * constant.mean(0)[row],
             color=plots.GREY,
             linestyle=":",
             linewidth=2.0,
@@ -137,7 +140,8 @@ def decile_plot(rows: list[dict], level: float) -> str:
         for model, (colour, marker) in style.items():
             shares = interval_values(rows, model, quantity, "decile_coverage").mean(0)[row]
             axes.plot(
-                *(tenths, 100.0 * shares),
+                tenths,
+                100.0 * shares,
                 color=colour,
                 marker=marker,
                 markersize=5,
@@ -257,7 +261,9 @@ def scanline_plot(arrays: dict[str, np.ndarray], model: str) -> str:
     figure = Figure(figsize=(10.6, 3.3), layout="constrained")
     axes = figure.add_subplot()
     axes.fill_between(
-        *(x, value - half, value + half),
+        x,
+        value - half,
+        value + half,
         color=plots.SKY,
         alpha=0.45,
         linewidth=0,
