@@ -81,7 +81,8 @@ def test_every_script_is_tried():
         for path in (ROOT / "experiments").rglob("*.py")
         if '__name__ == "__main__"' in (text := path.read_text()) and any(s in text for s in starts)
     }
-    assert scripts == READS.keys()
+    # `check_device` reads no file, and ends at once where there is no accelerator.
+    assert scripts - {"check_device"} == READS.keys()
 
 
 @pytest.mark.parametrize(
