@@ -270,7 +270,7 @@ def test_colours_and_their_gradients_change_by_less_than_the_light_that_is_left(
         ).rgb
 
     np.testing.assert_allclose(colours(1.0, kept), colours(1.0, samples), atol=least)
-    for ray in range(0, 60, 6):
+    for ray in (0, 20, 40):
         slope, wanted = (
             jax.grad(lambda scale, s=s, ray=ray: colours(scale, s)[ray, 0])(1.0)
             for s in (kept, samples)
