@@ -7,5 +7,5 @@ def get_config():
     config = base.get_config()
     # The paper's own policy, "bavs", loses to chance here; see the tables of the README.
     config.policies = ("bavs_spread", "random")
-    config.train.num_steps = 1600
+    config.train.num_steps = 1400
     return config
