@@ -19,7 +19,7 @@ from bavs_jax.candidates import Candidates, CandidateSource
 from bavs_jax.selection.batch import SelectionInfo, acquire
 from bavs_jax.selection.context import make_context
 from bavs_jax.selection.policy import Policy
-from bavs_jax.training.batches import PixelTable
+from bavs_jax.training.batches import PixelTable, view_mask
 from bavs_jax.training.fit import fit
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import Situation
@@ -73,12 +73,10 @@ class Stages(NamedTuple):
 
 def init_active_state(train: TrainState, table: PixelTable, initial_views) -> ActiveState:
     """A state before its first training call, with the initial views (given as ids) in use."""
-    is_training = np.zeros(len(table.cameras), bool)
-    is_training[np.asarray(initial_views)] = True
     return ActiveState(
         train=train,
         table=table,
-        is_training_view=jnp.asarray(is_training),
+        is_training_view=jnp.asarray(view_mask(table, initial_views)),
         round=jnp.int32(0),
         calls=jnp.int32(0),
         restarts=jnp.int32(0),

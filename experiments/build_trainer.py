@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from bavs_jax.fields.base import Field
 from bavs_jax.fields.flow_field import FlowField, mean_field
 from bavs_jax.rendering.samplers import Sampler
 from bavs_jax.scenes import Scene
-from bavs_jax.training.fit import check_call, fit
+from bavs_jax.training.fit import Fitted, check_call, fit
 from bavs_jax.training.objectives import (
     make_colour_objective,
     make_flow_objective,
@@ -110,6 +110,32 @@ def calls_per_round(config) -> int:
     return -(-config.train.num_steps // config.train.steps_per_call)
 
 
+def fit_field(
+    config, init, call, key, train: TrainState, table, is_training_view, *, label: str, **done
+) -> Iterator[Fitted]:
+    """`fit` for a round of a config.
+
+    Args:
+      config: see `experiments/configs/base.py`.
+      init, call, key, train, table, is_training_view, label: see `fit`.
+      **done: `calls` and `restarts` of `fit`.
+    """
+    num_calls = calls_per_round(config)
+    looked_at = check_call(num_calls, config.train.steps_per_call)
+    return fit(
+        key,
+        init,
+        call,
+        train,
+        table,
+        is_training_view,
+        num_calls=num_calls,
+        check_call=looked_at,
+        label=label,
+        **done,
+    )
+
+
 def train_aside(
     config, trainer: Trainer, key, situation: Situation, kind: str, track
 ) -> TrainState:
@@ -122,15 +148,14 @@ def train_aside(
     init_key, steps_key = jax.random.split(jax.random.fold_in(key, 0))
     state = trainer.init(init_key)
     with track(num_calls * steps, f"{situation.label}: train {kind}", "steps") as bar:
-        for fitted in fit(
-            steps_key,
+        for fitted in fit_field(
+            config,
             trainer.init,
             trainer.call,
+            steps_key,
             state,
             situation.table,
             situation.is_training_view,
-            num_calls=num_calls,
-            check_call=check_call(num_calls, steps),
             label=f"{kind} field",
         ):
             state = fitted.train

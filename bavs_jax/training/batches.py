@@ -123,6 +123,13 @@ def view_pixel_rays(cameras: Cameras, view_ids: jax.Array, pixel_ids: jax.Array)
     return pixel_rays(cameras, view_ids, pixels)
 
 
+def view_mask(table: PixelTable, view_ids) -> np.ndarray:
+    """Which views of a table are the given ones, [V] bool."""
+    mask = np.zeros(len(table.cameras), bool)
+    mask[np.asarray(view_ids)] = True
+    return mask
+
+
 def training_pixels(table: PixelTable, is_training_view) -> tuple[np.ndarray, np.ndarray]:
     """All pixels of the training views that are not masked: view ids [N] and row numbers [N]."""
     offsets, mask = np.asarray(table.offsets), np.asarray(table.pixel_mask)

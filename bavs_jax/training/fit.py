@@ -72,7 +72,7 @@ def fit(
       table, is_training_view: the photos, and which are trained on.
       num_calls: how many compiled calls there are in all.
       check_call: after how many of them a field that is stuck starts afresh with another key, at
-        most `MAX_RESTARTS` times; None: never. See `health.check_call`.
+        most `MAX_RESTARTS` times; None: never. See the function `check_call`.
       calls, restarts: done before.
       label: what is trained, for the error.
 

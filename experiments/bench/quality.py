@@ -8,12 +8,13 @@ import time
 import jax
 import numpy as np
 
-from bavs_jax.active import init_active_state, round_keys
-from bavs_jax.training.fit import check_call, fit
+from bavs_jax.active import round_keys
+from bavs_jax.training.batches import view_mask
 from experiments import runtime
 from experiments.bench.subject import SEED
 from experiments.build import build_problem
 from experiments.build_scene import initial_views, load_config_scene
+from experiments.build_trainer import fit_field
 from experiments.errors import ConfigError, shown
 from experiments.evaluate import evaluate_views, spread_evenly
 from experiments.keys import run_key, stream_key
@@ -59,21 +60,19 @@ def measure_run(config, *, num_views: int, num_test_views: int, every: int, star
     steps, key = config.train.steps_per_call, run_key(SEED)
     calls_between = -(-every // steps)
     train = problem.init_train(stream_key(SEED, "init"))
-    is_training = init_active_state(train, problem.table, initial).is_training_view
     num_calls = problem.calls_per_round
     *_, train_key = round_keys(key, 0)
     paused, curve = 0.0, []
 
     with track(num_calls * steps, f"train on {num_views} views", "steps") as bar:
-        for fitted in fit(
-            train_key,
+        for fitted in fit_field(
+            config,
             problem.init_train,
             problem.train_call,
+            train_key,
             train,
             problem.table,
-            is_training,
-            num_calls=num_calls,
-            check_call=check_call(num_calls, steps),
+            view_mask(problem.table, initial),
             label="train",
         ):
             if fitted.calls % calls_between == 0 or fitted.calls == num_calls:

@@ -13,14 +13,13 @@ from bavs_jax.active import init_active_state
 from bavs_jax.cameras import take
 from bavs_jax.rendering.images import render_views
 from bavs_jax.scenes import Scene
-from bavs_jax.training.batches import training_pixels
+from bavs_jax.training.batches import training_pixels, view_mask
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE
 from bavs_jax.uncertainty.scoring import mean_uncertainty
 from bavs_jax.uncertainty.streaming import table_rays
 from experiments import runtime
 from experiments.build import RENDER_CHUNK, build_problem
 from experiments.build_scene import initial_views, load_config_scene
-from experiments.build_trainer import build_trainer
 from experiments.configs import base
 from experiments.keys import run_key, stream_key
 from experiments.progress import track
@@ -78,16 +77,14 @@ def numbers_on(
     """
     with jax.default_device(device):
         problem = build_problem(config, scene, kind)
-        table, num_rows = problem.table, len(problem.table.cameras)
-        trainer = build_trainer(config, scene, num_rows, kind)
-        is_training = np.zeros(num_rows, bool)
+        table, train_call = problem.table, problem.train_call
         initial = initial_views(scene, SEED, config.num_initial)
-        is_training[initial] = True
+        is_training = view_mask(table, initial)
         init_key, key = stream_key(SEED, "init"), run_key(SEED)
         if trained is None:
-            state = trainer.init(init_key)
+            state = problem.init_train(init_key)
             for number in range(NUM_STEPS):
-                state, _ = trainer.call(jax.random.fold_in(key, number), state, table, is_training)
+                state, _ = train_call(jax.random.fold_in(key, number), state, table, is_training)
             trained = jax.tree.map(np.asarray, state)
         state = jax.device_put(trained, device)
 
@@ -118,8 +115,8 @@ def numbers_on(
             step(key, whole, lambda state, choice, to=choices: to.append(choice))
             found[f"views, {name}"] = choices[0].view_ids
         # Adam's first mean is a share of the gradient. Last, since the state is given away.
-        state = state.replace(opt_state=trainer.init(init_key).opt_state)
-        state, info = trainer.call(jax.random.fold_in(key, NUM_STEPS), state, table, is_training)
+        state = state.replace(opt_state=problem.init_train(init_key).opt_state)
+        state, info = train_call(jax.random.fold_in(key, NUM_STEPS), state, table, is_training)
         moments = jax.tree.leaves(optax.tree_utils.tree_get(state.opt_state, "mu"))
         found["loss"] = info.loss
         found["gradient"] = np.concatenate([np.ravel(moment) for moment in moments])

@@ -12,7 +12,7 @@ from ml_collections import ConfigDict
 from bavs_jax.cameras import Cameras, take
 from bavs_jax.candidates import scene_hemisphere
 from bavs_jax.scenes import Scene
-from bavs_jax.training.batches import training_pixels
+from bavs_jax.training.batches import training_pixels, view_mask
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation, Toolbox
 from bavs_jax.uncertainty.scoring import reduced_cameras
@@ -97,8 +97,7 @@ def make_subject(config, scene: Scene, num_views: int) -> Subject:
       num_views: training views, drawn as those that a run begins with.
     """
     problem = build_problem(changed(config, lpips_net=""), scene)
-    is_training = np.zeros(len(problem.table.cameras), bool)
-    is_training[initial_views(scene, SEED, num_views)] = True
+    is_training = view_mask(problem.table, initial_views(scene, SEED, num_views))
     trainer = build_trainer(config, scene, len(is_training), RECONSTRUCTION)
     sampler = trainer.sampler
 

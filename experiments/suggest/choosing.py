@@ -23,7 +23,7 @@ from bavs_jax.selection.information import (
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.selection.worth import Worth, worth_along
 from bavs_jax.sources import make_candidate_curvature_fn
-from bavs_jax.training.batches import num_training_pixels
+from bavs_jax.training.batches import num_training_pixels, view_mask
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
 from bavs_jax.uncertainty.posterior import posterior_precision
@@ -78,8 +78,7 @@ def photo_rays(problem: Problem) -> int:
 
 def photo_situation(problem: Problem, train: TrainState, cameras: Cameras) -> Situation:
     """All photos are trained on; C cameras are candidates."""
-    is_training = np.zeros(len(problem.table.cameras), bool)
-    is_training[problem.scene.pool] = True
+    is_training = view_mask(problem.table, problem.scene.pool)
     return Situation(
         train,
         problem.table,

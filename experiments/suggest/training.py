@@ -9,14 +9,15 @@ import time
 import jax.numpy as jnp
 import numpy as np
 
-from bavs_jax.active import init_active_state, round_keys
+from bavs_jax.active import round_keys
 from bavs_jax.scenes import Scene, SceneError
+from bavs_jax.training.batches import view_mask
 from bavs_jax.training.checkpoints import Checkpoints
-from bavs_jax.training.fit import check_call, fit
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import Situation
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from experiments.build import Problem
+from experiments.build_trainer import fit_field
 from experiments.evaluate import evaluate_views, spread_evenly
 from experiments.files import read_arrays, write_arrays
 from experiments.keys import run_key, stream_key
@@ -52,18 +53,16 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
     num_calls = problem.calls_per_round
     if calls < num_calls:
         saved_at = time.monotonic()
-        is_training = init_active_state(train, problem.table, pool).is_training_view
         *_, key = round_keys(run_key(seed), 0)
         with track((num_calls - calls) * steps, f"train on {len(pool)} photos", "steps") as bar:
-            for fitted in fit(
-                key,
+            for fitted in fit_field(
+                config,
                 problem.init_train,
                 problem.train_call,
+                key,
                 train,
                 problem.table,
-                is_training,
-                num_calls=num_calls,
-                check_call=check_call(num_calls, steps),
+                view_mask(problem.table, pool),
                 calls=calls,
                 restarts=restarts,
                 label="photos",
@@ -87,8 +86,7 @@ def photo_curvature(problem: Problem, train: TrainState, folder: pathlib.Path, s
     path = folder / "curvature.npz"
     if (kept := read_arrays(path, "jac_sq_sum")) is not None:
         return jnp.asarray(kept["jac_sq_sum"])
-    is_training = np.zeros(len(problem.table.cameras), bool)
-    is_training[problem.scene.pool] = True
+    is_training = view_mask(problem.table, problem.scene.pool)
     toolbox = problem.make_toolbox(track)
     situation = Situation(train, problem.table, is_training, num_rays=0, label="photos")
     jac_sq_sum = training_curvature(
