@@ -40,6 +40,7 @@ setup(
         "ray": ["ray>=2.60"],
         "test": [
             "hypothesis>=6.100",
+            "mypy>=1.10",
             "opencv-python-headless>=4.9",
             "pycolmap>=3.11",
             "pynrrd>=1.1",

@@ -1,4 +1,4 @@
-"""Cameras as arrays: poses, pixels to rays, candidate poses.
+"""Cameras as arrays: poses, pixels to rays, points to pixels, candidate poses.
 
 Poses use the OpenGL axes (x right, y up, the camera looks along -z) and pixel centres lie at
 integer + 0.5, so that the ray through the middle of a W x H image is pixel (W / 2, H / 2).
@@ -11,29 +11,29 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from bavs_jax.lenses import lens_directions, undistort
+from bavs_jax.arrays import Array
+from bavs_jax.lenses import LENSES, lens_directions, rising_radii, undistort
+from bavs_jax.numerics import safe_divide
 
 
-@struct.dataclass
-class Rays:
+class Rays(struct.PyTreeNode):
     """Half lines in world space; `directions` are unit vectors, so `t` is a distance."""
 
-    origins: jax.Array  # [..., 3] scene units
-    directions: jax.Array  # [..., 3] unit
+    origins: Array  # [..., 3] scene units
+    directions: Array  # [..., 3] unit
 
 
-@struct.dataclass
-class Cameras:
+class Cameras(struct.PyTreeNode):
     """V posed cameras with one lens model; images may differ in size."""
 
-    world_from_cam: jax.Array  # [V, 3, 4] OpenGL axes, scene units
-    intrinsics: jax.Array  # [V, 4] fx, fy, cx, cy in pixels
-    distortion: jax.Array  # [V, 6] k1, k2, k3, k4, p1, p2; a fisheye has no p1, p2
-    sizes: jax.Array  # [V, 2] int32 width, height in pixels
+    world_from_cam: Array  # [V, 3, 4] OpenGL axes, scene units
+    intrinsics: Array  # [V, 4] fx, fy, cx, cy in pixels
+    distortion: Array  # [V, 6] k1, k2, k3, k4, p1, p2; a fisheye has no p1, p2
+    sizes: Array  # [V, 2] int32 width, height in pixels
     lens: str = struct.field(pytree_node=False, default="pinhole")  # a key of `lenses.LENSES`
 
     @property
-    def positions(self) -> jax.Array:
+    def positions(self) -> Array:
         """Camera centres [V, 3], scene units."""
         return self.world_from_cam[..., :, 3]
 
@@ -49,19 +49,16 @@ def num_pixels(cameras: Cameras) -> np.ndarray:
 # --- pixels to rays --------------------------------------------------------------------------
 
 
-def pixel_rays(cameras: Cameras, view_ids: jax.Array, pixels: jax.Array) -> Rays:
-    """Rays through given pixels: `origin = t`, `direction = R lens_directions(undistort(xy))`.
+def pixel_rays(cameras: Cameras, view_ids: Array, pixels: Array) -> Rays:
+    """Rays [R, 3] through pixels: `origin = t`, `direction = R lens_directions(undistort(xy))`.
 
     Args:
       cameras: V cameras.
       view_ids: [R] int, which camera each ray belongs to.
       pixels: [R, 2] x (to the right) and y (down) in pixels; the first pixel's centre is 0.5.
-
-    Returns:
-      `Rays` of shape [R, 3].
     """
     fx, fy, cx, cy = (cameras.intrinsics[view_ids, i] for i in range(4))
-    xy = jnp.stack([(pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy], axis=-1)
+    xy: Array = jnp.stack([(pixels[..., 0] - cx) / fx, (pixels[..., 1] - cy) / fy], axis=-1)
     if cameras.lens != "pinhole":
         xy = jax.vmap(lambda p, d: undistort(p, d, lens=cameras.lens))(
             xy, cameras.distortion[view_ids]
@@ -81,6 +78,47 @@ def image_pixels(width: int, height: int) -> np.ndarray:
     """Pixel centres of a whole image in row order, [H * W, 2] float32 (x, y)."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
+
+
+# --- points to pixels ----------------------------------------------------------------------------
+
+
+def project(camera: Cameras, points: Array) -> tuple[jax.Array, jax.Array]:
+    """Pixel at which a camera sees each point, were nothing in between; undoes `pixel_rays`.
+
+    `pixel = f distort(xy) + c` with `xy` the point on the lens's undistorted plane (`lenses.py`).
+
+    Args:
+      camera: one camera: `Cameras` without the axis of views, as under `jax.vmap` or a scan.
+      points: [..., 3] scene units.
+
+    Returns:
+      pixels [..., 2] x (to the right) and y (down), 0 for what is not in the image;
+      is_in_image [...] bool: in front of the camera, within the lens's range and within the image.
+    """
+    pose = camera.world_from_cam
+    # Spelt out by components for the reasons given in `pixel_rays`.
+    x, y, z = (points[..., i] - pose[i, 3] for i in range(3))
+    right, up, back = (x * pose[0, i] + y * pose[1, i] + z * pose[2, i] for i in range(3))
+    down, ahead = -up, -back
+    across = jnp.stack([right, down], axis=-1)
+    if camera.lens == "fisheye":
+        radius = jnp.linalg.norm(across, axis=-1)
+        is_shown = (radius > 0.0) | (ahead > 0.0)
+        scale = safe_divide(jnp.arctan2(radius, ahead), radius)
+    else:
+        is_shown = ahead > 0.0
+        scale = jnp.where(is_shown, 1.0, 0.0) / jnp.where(is_shown, ahead, 1.0)
+    xy = scale[..., None] * across
+    if camera.lens != "pinhole":
+        # Beyond the lens's range its polynomial folds the outside back into the image.
+        is_shown &= (
+            jnp.linalg.norm(xy, axis=-1) < rising_radii(camera.distortion, lens=camera.lens)[-1]
+        )
+    seen_at = LENSES[camera.lens](xy, camera.distortion)
+    pixels = camera.intrinsics[:2] * seen_at + camera.intrinsics[2:]
+    is_in_image = is_shown & ((pixels >= 0.0) & (pixels <= camera.sizes)).all(axis=-1)
+    return jnp.where(is_in_image[..., None], pixels, 0.0), is_in_image
 
 
 # --- host-side helpers -----------------------------------------------------------------------
@@ -114,6 +152,12 @@ def rescale(cameras: Cameras, sizes) -> Cameras:
     return cameras.replace(intrinsics=cameras.intrinsics * scale, sizes=sizes)
 
 
+def reduced_cameras(cameras: Cameras, image_scale: float) -> Cameras:
+    """The same cameras with images of `image_scale` times the width and height, at least 1 px."""
+    sizes = np.maximum(np.round(np.asarray(cameras.sizes) * image_scale), 1).astype(np.int32)
+    return rescale(cameras, sizes)
+
+
 def look_at(position, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
     """Pose [3, 4] of a camera at `position` that looks at `target`, OpenGL axes.
 
@@ -130,7 +174,7 @@ def look_at(position, target, up=(0.0, 0.0, 1.0)) -> np.ndarray:
 
 
 def hemisphere_poses(key, num: int, *, centre, radius: float, up=(0.0, 0.0, 1.0)) -> np.ndarray:
-    """Candidate poses uniform in area on the upper hemisphere, looking at its centre (Eq 14).
+    """Poses [num, 3, 4] uniform in area on the upper hemisphere, looking at its centre (Eq 14).
 
     `phi = 2 pi u`, `theta = arccos(1 - v)` with `u, v ~ U[0, 1]`, `theta` measured from `up`.
 
@@ -140,9 +184,6 @@ def hemisphere_poses(key, num: int, *, centre, radius: float, up=(0.0, 0.0, 1.0)
       centre: [3] scene centre, scene units.
       radius: camera distance, scene units.
       up: [3] the hemisphere's pole.
-
-    Returns:
-      [num, 3, 4] poses, float32.
     """
     u, v = np.asarray(jax.random.uniform(key, (2, num)), np.float64)
     phi, cos_theta = 2.0 * np.pi * u, 1.0 - v

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bavs_jax.arrays import Array
 from bavs_jax.cameras import Cameras, hemisphere_poses, take
+from bavs_jax.pixel_table import PixelTable
 from bavs_jax.scenes.base import Scene
-from bavs_jax.training.batches import PixelTable
 
 
 class Candidates(NamedTuple):
@@ -22,16 +23,28 @@ class Candidates(NamedTuple):
     mask: np.ndarray  # [C] bool
 
 
+class Propose(Protocol):
+    """Candidates where the marked views [V] are trained on already; the same C at every call."""
+
+    def __call__(
+        self, key: jax.Array, table: PixelTable, is_training_view: Array, /
+    ) -> Candidates: ...
+
+
+class TakePictures(Protocol):
+    """The table with the pictures of the candidates `selected` [k] in it, and their view ids [k]:
+    rows of the table that may be trained on from now on."""
+
+    def __call__(
+        self, table: PixelTable, is_training_view: Array, candidates: Candidates, selected: Array, /
+    ) -> tuple[PixelTable, np.ndarray]: ...
+
+
 class CandidateSource(NamedTuple):
-    """Where candidates come from.
+    """Where candidates come from."""
 
-    `propose(key, table, is_training_view) -> Candidates`, of the same C at every call.
-    `acquire(table, is_training_view, candidates, selected [k]) -> (table, view ids [k])`: takes
-    the pictures; the view ids are rows of the table that may be trained on from now on.
-    """
-
-    propose: Callable
-    acquire: Callable
+    propose: Propose
+    acquire: TakePictures
 
 
 def dataset_candidates(scene: Scene, *, hemisphere_draws: int | None = None) -> CandidateSource:
@@ -65,13 +78,17 @@ def dataset_candidates(scene: Scene, *, hemisphere_draws: int | None = None) -> 
 
 
 def captured_candidates(
-    scene: Scene, capture_fn: Callable, *, num_candidates: int, first_slot: int
+    scene: Scene,
+    capture_fn: Callable[[Cameras], tuple[Array, Array]],
+    *,
+    num_candidates: int,
+    first_slot: int,
 ) -> CandidateSource:
     """Free poses on the hemisphere (Eq 14), photographed when they are chosen.
 
     Args:
       scene: the scene, with empty views from `first_slot` on (see `with_empty_views`).
-      capture_fn: `Cameras` [k] -> (pixels [k * H * W, 3], alpha [k * H * W]), both uint8.
+      capture_fn: from k cameras to pixels [k * H * W, 3] and alpha [k * H * W], both uint8.
       num_candidates: C.
       first_slot: first view that a picture may be put into.
     """

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import ParamSpec, TypeVar
 
 import jax
 import numpy as np
@@ -17,6 +18,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 AXIS = "rays"
 ONE_EACH, ON_ALL = PartitionSpec(AXIS), PartitionSpec()
+
+
+Args = ParamSpec("Args")
+Result = TypeVar("Result")
 
 
 def make_mesh(num_devices: int = 0) -> Mesh | None:
@@ -40,7 +45,9 @@ def num_shards(mesh: Mesh | None) -> int:
     return 1 if mesh is None else mesh.size
 
 
-def over_rays(fn: Callable, mesh: Mesh | None, *, spread: tuple[bool, ...]) -> Callable:
+def over_rays(
+    fn: Callable[Args, Result], mesh: Mesh | None, *, spread: tuple[bool, ...]
+) -> Callable[Args, Result]:
     """Runs `fn` on each device for that device's rays alone.
 
     Args:
@@ -56,13 +63,15 @@ def over_rays(fn: Callable, mesh: Mesh | None, *, spread: tuple[bool, ...]) -> C
     return jax.shard_map(fn, mesh=mesh, in_specs=specs, out_specs=ONE_EACH, check_vma=False)
 
 
-def jit_over_rays(fn: Callable, mesh: Mesh | None, *, spread: tuple[bool, ...]) -> Callable:
+def jit_over_rays(
+    fn: Callable[Args, Result], mesh: Mesh | None, *, spread: tuple[bool, ...]
+) -> Callable[Args, Result]:
     """Compiles `over_rays`; what it returns is whole on every device, and so in every process."""
     fn_over_rays = over_rays(fn, mesh, spread=spread)
 
     @functools.wraps(fn)  # traces and profiles bear the name of what they run
-    def gathered(*args):
-        return gather_rays(fn_over_rays(*args), mesh)
+    def gathered(*args: Args.args, **kwargs: Args.kwargs) -> Result:
+        return gather_rays(fn_over_rays(*args, **kwargs), mesh)
 
     return jax.jit(gathered)
 

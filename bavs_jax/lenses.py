@@ -11,32 +11,34 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bavs_jax.arrays import Array
+
 RADII = 64  # among which a radius is looked up before Newton's method refines it
 RADIUS_STEPS = 8
 TANGENTIAL_STEPS = 5
 
 
-def distort_pinhole(xy: jax.Array, distortion: jax.Array) -> jax.Array:
+def distort_pinhole(xy: Array, distortion: Array) -> Array:
     """The ideal lens: points are seen where they are."""
     del distortion
     return xy
 
 
-def radial_polynomial(radius: jax.Array, distortion: jax.Array) -> jax.Array:
+def radial_polynomial(radius: Array, distortion: Array) -> Array:
     """Seen radius `r (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8)`."""
     k1, k2, k3, k4 = (distortion[..., i] for i in range(4))
     r2 = radius * radius
     return radius * (1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4))))
 
 
-def radial_slope(radius: jax.Array, distortion: jax.Array) -> jax.Array:
+def radial_slope(radius: Array, distortion: Array) -> Array:
     """Derivative of `radial_polynomial` by the radius."""
     k1, k2, k3, k4 = (distortion[..., i] for i in range(4))
     r2 = radius * radius
     return 1.0 + r2 * (3.0 * k1 + r2 * (5.0 * k2 + r2 * (7.0 * k3 + r2 * 9.0 * k4)))
 
 
-def distort_opencv(xy: jax.Array, distortion: jax.Array) -> jax.Array:
+def distort_opencv(xy: Array, distortion: Array) -> Array:
     """Brown-Conrady: radial `1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8` and tangential `p1, p2`.
 
     Differs from OpenCV: `k4` is the `r^8` term, as in nerfstudio, not a denominator.
@@ -50,7 +52,7 @@ def distort_opencv(xy: jax.Array, distortion: jax.Array) -> jax.Array:
     return jnp.stack([xd, yd], axis=-1)
 
 
-def distort_fisheye(xy: jax.Array, distortion: jax.Array) -> jax.Array:
+def distort_fisheye(xy: Array, distortion: Array) -> Array:
     """Kannala-Brandt: `theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)`.
 
     The plane is that of angles, `xy = theta (cos phi, sin phi)`; there is no tangential part.
@@ -64,7 +66,7 @@ def distort_fisheye(xy: jax.Array, distortion: jax.Array) -> jax.Array:
 LENSES = {"pinhole": distort_pinhole, "opencv": distort_opencv, "fisheye": distort_fisheye}
 
 
-def rising_radii(distortion: jax.Array, *, lens: str) -> jax.Array:
+def rising_radii(distortion: Array, *, lens: str) -> Array:
     """Radii from 0 up to where a lens stops to show each direction at a place of its own.
 
     The last one is where the radial polynomial first stops to rise: beyond it the image folds
@@ -90,7 +92,7 @@ def rising_radii(distortion: jax.Array, *, lens: str) -> jax.Array:
     return jnp.minimum(radii, radii[before] + share * (radii[after] - radii[before]))
 
 
-def undistort_radius(seen: jax.Array, distortion: jax.Array, *, lens: str) -> jax.Array:
+def undistort_radius(seen: Array, distortion: Array, *, lens: str) -> Array:
     """Inverts the radial polynomial by Newton's method within a bracket.
 
     Args:
@@ -121,7 +123,7 @@ def undistort_radius(seen: jax.Array, distortion: jax.Array, *, lens: str) -> ja
     return jnp.where(seen < values[-1], radius, radii[-1])
 
 
-def undistort(xy_distorted: jax.Array, distortion: jax.Array, *, lens: str) -> jax.Array:
+def undistort(xy_distorted: Array, distortion: Array, *, lens: str) -> Array:
     """Inverts a lens by Newton's method with its exact derivative.
 
     Solves `distort(xy) = xy_distorted`: first along the radius alone, then for both coordinates
@@ -163,7 +165,7 @@ def undistort(xy_distorted: jax.Array, distortion: jax.Array, *, lens: str) -> j
     return xy
 
 
-def lens_directions(xy: jax.Array, *, lens: str) -> jax.Array:
+def lens_directions(xy: Array, *, lens: str) -> jax.Array:
     """Directions that the points of a lens's undistorted plane stand for, OpenGL axes.
 
     `[x, -y, -1]`, or `[sin(theta) x / theta, -sin(theta) y / theta, -cos(theta)]` with

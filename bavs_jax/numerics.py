@@ -5,6 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from bavs_jax.arrays import Array
+
 MAX_LOG_DENSITY = 12.0
 MIN_VARIANCE = 0.01  # of a point's colour, where a field learns one
 MIN_OPACITY = 1e-6  # what is relative to a ray's opacity is 0 below it, or gradients overflow
@@ -32,7 +34,7 @@ def point_variance(raw: jax.Array) -> jax.Array:
     return jax.nn.softplus(raw) + MIN_VARIANCE
 
 
-def safe_divide(numerator: jax.Array, denominator: jax.Array) -> jax.Array:
+def safe_divide(numerator: Array, denominator: Array) -> jax.Array:
     """`numerator / denominator`, and 0 with gradient 0 where the denominator is 0."""
     is_zero = denominator == 0
     return jnp.where(is_zero, 0.0, numerator / jnp.where(is_zero, 1.0, denominator))
@@ -56,7 +58,7 @@ def x_log_x(x: jax.Array) -> jax.Array:
     return jnp.where(is_zero, 0.0, x * jnp.log(jnp.where(is_zero, 1.0, x)))
 
 
-def safe_reciprocal(x: jax.Array) -> jax.Array:
+def safe_reciprocal(x: Array) -> jax.Array:
     """`1 / x` for ray-box tests: a zero component becomes 1e-12 and keeps its sign."""
     tiny = jnp.where(jnp.signbit(x), -1e-12, 1e-12)
     return 1.0 / jnp.where(jnp.abs(x) < 1e-12, tiny, x)

@@ -13,9 +13,9 @@ from bavs_jax.candidates import (
     dataset_candidates,
     with_empty_views,
 )
+from bavs_jax.pixel_table import PixelTable
 from bavs_jax.scenes import Scene, SceneError, load_scene, sculpture
 from bavs_jax.scenes.procedural import capture
-from bavs_jax.training.batches import PixelTable
 from experiments.errors import ConfigError
 
 MAX_NEW_PIXELS = 1 << 30  # of pictures taken on the way, for which room is made at the start

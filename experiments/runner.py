@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import pathlib
 import time
 from functools import partial
@@ -11,10 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bavs_jax.active import ActiveState, Choice, init_active_state
-from bavs_jax.training.batches import num_training_pixels
+from bavs_jax import active
+from bavs_jax.active import ActiveState, Choice
+from bavs_jax.devices import num_shards
+from bavs_jax.pixel_table import num_training_pixels
 from bavs_jax.training.checkpoints import Checkpoints
-from bavs_jax.training.fit import MAX_RESTARTS
+from bavs_jax.training.fit import MAX_RESTARTS, fit
 from bavs_jax.uncertainty.model import Situation
 from experiments import acquisitions
 from experiments.build import Problem
@@ -40,7 +41,7 @@ LOG_EVERY = 10  # training calls between two lines of metrics.jsonl
 
 
 class Run:
-    """Drives the active step for one policy and seed, and keeps the run's files up to date.
+    """Trains and chooses in turn for one policy and seed, and keeps the run's files up to date.
 
     Round 0 is the same for all policies of a seed that train the same kind of field: it is made
     once, in `initial/seed_<n>` or `initial_<kind>/seed_<n>`, by a `Run` whose policy is None.
@@ -69,19 +70,18 @@ class Run:
         state = self._start(shared)
         if self.policy and not is_finished(self.workdir, self.part):
             acquisitions.load_choices(self.folder, int(state.round))  # whether they can be read
-        step = self.problem.make_step(
-            self.policy or self.config.policies[0], self.initial, track, self.label
-        )
         last_round = self.config.num_rounds if self.policy else 0
         while True:
             number = int(state.round)
-            if self._is_trained(state) and len(self.rounds) == number:
+            if not self._is_trained(state):
+                state = self._train(state)
+            if len(self.rounds) == number:
                 self._measure_round(state, is_last=number == self.config.num_rounds)
-            if self._is_trained(state) and self.policy:
+            if self.policy:
                 self._write_files(state, completed=number == last_round)
-            if self._is_trained(state) and number >= last_round:
+            if number >= last_round:
                 break
-            state = self._one_step(step, state)
+            state = self._choose(state)
         if self.policy is None:
             write_json(self.folder / "round_0.json", self.rounds[0])
         self.checkpoints.close()
@@ -102,49 +102,54 @@ class Run:
     # --- one round ---
 
     def _is_trained(self, state: ActiveState) -> bool:
-        return int(state.calls) >= self.problem.calls_per_round
+        return int(state.calls) >= self.problem.trainer.num_calls
 
-    def _one_step(self, step, state: ActiveState) -> ActiveState:
-        """Runs the active step with a bar, a log and checkpoints."""
-        calls_per_round = self.problem.calls_per_round
-        steps = self.config.train.steps_per_call
-        with contextlib.ExitStack() as stack:
-            bar, clock, saved = None, time.monotonic(), time.monotonic()
+    def _choose(self, state: ActiveState) -> ActiveState:
+        """Opens the next round with the views that the policy chooses."""
+        number = int(state.round) + 1
+        choose_key, restart_key, _ = active.round_keys(run_key(self.seed), number)
+        acquisition = self.problem.acquisition(self.policy, self.initial, self.label)
+        choice = active.select(choose_key, state, acquisition)
+        state, view_ids = active.update(state, choice, acquisition.source)
+        self._record_choice(number, choice, view_ids)
+        return state.replace(train=self.problem.restart(restart_key, state.train))
 
-            def open_bar(state):
-                nonlocal bar, clock
-                left = (calls_per_round - int(state.calls)) * steps
-                label = f"{self.label}: train on {int(state.is_training_view.sum())} views"
-                bar, clock = stack.enter_context(track(left, label, "steps")), time.monotonic()
-
-            def on_choice(state, choice):
-                self._record_choice(int(state.round), choice)
-                open_bar(state)
-
-            def on_call(state, info):
-                nonlocal clock, saved
-                jax.block_until_ready(info)
+    def _train(self, state: ActiveState) -> ActiveState:
+        """Trains the round to its end, with a bar, a log and checkpoints."""
+        trainer, steps = self.problem.trainer, self.config.train.steps_per_call
+        _, _, train_key = active.round_keys(run_key(self.seed), int(state.round))
+        left = (trainer.num_calls - int(state.calls)) * steps
+        label = f"{self.label}: train on {int(state.is_training_view.sum())} views"
+        with track(left, label, "steps") as bar:
+            clock = saved = time.monotonic()
+            for fitted in fit(
+                train_key,
+                trainer,
+                state.train,
+                state.table,
+                state.is_training_view,
+                calls=int(state.calls),
+                restarts=int(state.restarts),
+                label=f"round {int(state.round)}",
+            ):
+                state, info = active.trained(state, fitted), jax.block_until_ready(fitted.info)
                 self.pending["seconds"]["train"] += time.monotonic() - clock
-                if int(state.restarts) > self.pending["restarts"]:
+                at_end = self._is_trained(state)
+                if fitted.restarts > self.pending["restarts"]:
                     self._record_restart(state, info)
-                if int(state.calls) == calls_per_round:
+                if at_end:
                     self.pending["stuck"] = self.problem.is_stuck(info, state)
                 numbers = {"loss": float(info.loss), "psnr": float(-10 * jnp.log10(info.loss))}
                 bar.advance(steps, **numbers)
-                calls = int(state.calls)
-                if calls % LOG_EVERY == 0 or calls == calls_per_round:
+                if fitted.calls % LOG_EVERY == 0 or at_end:
                     shape = {k: float(getattr(info, k)) for k in ("rays", "samples", "thinned")}
-                    at = {"round": int(state.round), "step": calls * steps}
+                    at = {"round": int(state.round), "step": fitted.calls * steps}
                     self._log(event="train", **at, **numbers, **shape)
                 due = as_first_process(time.monotonic() - saved > self.config.checkpoint_seconds)
-                if due or calls == calls_per_round:
+                if due or at_end:
                     self._save(state)
                     saved = time.monotonic()
                 clock = time.monotonic()
-
-            if not self._is_trained(state):
-                open_bar(state)
-            state, _ = step(run_key(self.seed), state, on_choice, on_call)
         return state
 
     def _record_restart(self, state: ActiveState, info) -> None:
@@ -157,14 +162,14 @@ class Run:
             "trained anew with another key"
         )
 
-    def _record_choice(self, number: int, choice: Choice) -> None:
+    def _record_choice(self, number: int, choice: Choice, view_ids: np.ndarray) -> None:
         in_scene = not self.problem.has_empty_views
         acquisitions.save_choice(self.folder, number, choice, in_scene=in_scene)
         info = choice.selection
         self.pending = _new_pending()
         self.pending["seconds"] |= choice.seconds
         self.pending |= {
-            "selected": choice.view_ids.tolist(),
+            "selected": view_ids.tolist(),
             "num_candidates": int(choice.candidates.mask.sum()),
             "num_survivors": int(info.survivors.sum()) if info.filter else None,
             "farthest_overlap": int(info.farthest_overlap),
@@ -194,7 +199,7 @@ class Run:
     def _uncertain_render_fn(self, state: ActiveState):
         """Renders colour and uncertainty (Fig 4) of a state that may come from disk."""
         num_rays = int(num_training_pixels(self.problem.scene, self.initial).sum())
-        fns = self.problem.model_fns("laplace", track)
+        fns = self.problem.model_fns("laplace")
         situation = Situation(
             state.train,
             state.table,
@@ -210,9 +215,7 @@ class Run:
     def _start(self, shared: Run | None) -> ActiveState:
         """The last checkpoint's state, or the one where `shared` ended, or a fresh one."""
         init_key = stream_key(self.seed, "init")
-        fresh = init_active_state(
-            self.problem.init_train(init_key), self.problem.table, self.initial
-        )
+        fresh = active.init(self.problem.trainer.init(init_key), self.problem.table, self.initial)
         for run in (self, shared):
             found = run and run.checkpoints.restore(saved_part(self.problem, fresh))
             if found:
@@ -226,7 +229,7 @@ class Run:
         """Writes a checkpoint; its number grows with rounds, restarts, calls and measures."""
         calls = int(state.calls) + (len(self.rounds) > int(state.round))
         attempt = int(state.round) * (MAX_RESTARTS + 1) + int(state.restarts)
-        number = attempt * (self.problem.calls_per_round + 2) + calls
+        number = attempt * (self.problem.trainer.num_calls + 2) + calls
         meta = {"rounds": self.rounds, "pending": self.pending}
         self.checkpoints.save(number, saved_part(self.problem, state), meta)
 
@@ -271,7 +274,7 @@ class Run:
             "config": self.config.to_dict(),
             "versions": versions(),
             "device": device_name(),
-            "num_devices": self.problem.num_devices,
+            "num_devices": num_shards(self.problem.mesh),
             "peak_memory_mb": peak_memory_mb(),
             "completed": completed,
             "lpips_reason": self.problem.lpips_reason,
@@ -299,7 +302,7 @@ def _new_pending() -> dict:
 
 def saved_part(problem: Problem, state: ActiveState):
     """The state without the scene's own pixels, which its files hold already."""
-    first = problem.first_empty_row
+    first = int(problem.scene.offsets[-1])
     return {
         "train": state.train,
         "is_training_view": state.is_training_view,
@@ -318,8 +321,8 @@ def whole_state(problem: Problem, saved) -> ActiveState:
     cameras = table.cameras.replace(world_from_cam=saved["world_from_cam"])
     pixels, alpha = table.pixels, table.alpha
     if problem.has_empty_views:
-        pixels = pixels.at[problem.first_empty_row :].set(saved["new_pixels"])
-        alpha = alpha.at[problem.first_empty_row :].set(saved["new_alpha"])
+        pixels = pixels.at[int(problem.scene.offsets[-1]) :].set(saved["new_pixels"])
+        alpha = alpha.at[int(problem.scene.offsets[-1]) :].set(saved["new_alpha"])
     return ActiveState(
         train=saved["train"],
         table=table.replace(cameras=cameras, pixels=pixels, alpha=alpha),

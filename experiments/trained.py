@@ -11,8 +11,8 @@ import numpy as np
 from ml_collections import ConfigDict
 
 from bavs_jax.active import ActiveState
+from bavs_jax.pixel_table import num_training_pixels
 from bavs_jax.selection.policies import POLICIES, get_policy
-from bavs_jax.training.batches import num_training_pixels
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation, Toolbox
 from bavs_jax.uncertainty.models.laplace import laplace_variance, training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
@@ -21,7 +21,6 @@ from experiments.build_trainer import KINDS
 from experiments.configs import base
 from experiments.errors import WorkdirError
 from experiments.keys import stream_key
-from experiments.progress import track
 from experiments.runner import Run
 from experiments.schema import check_config
 
@@ -46,7 +45,7 @@ class TrainedRun(NamedTuple):
 
     @property
     def toolbox(self) -> Toolbox:
-        return self.problem.make_toolbox(track)
+        return self.problem.toolbox
 
     @property
     def situation(self) -> Situation:
@@ -166,7 +165,7 @@ def load_run(config, problem: Problem, workdir: pathlib.Path, policy: str, seed:
         folder=run.folder,
         policy=policy,
         seed=seed,
-        completed=int(state.round) == last_round and int(state.calls) >= problem.calls_per_round,
+        completed=int(state.round) == last_round and int(state.calls) >= problem.trainer.num_calls,
     )
 
 

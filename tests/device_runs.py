@@ -19,16 +19,17 @@ from bavs_jax.devices import make_mesh, num_shards, put_on_all
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.fields.flow_field import make_flow_field, mean_field
 from bavs_jax.fields.hash_grid import make_hash_grid_density, make_hash_grid_field
-from bavs_jax.rendering.proposals import make_proposal_sampler
-from bavs_jax.rendering.samplers import make_occupancy_sampler
-from bavs_jax.rendering.sampling import make_march_options
-from bavs_jax.rendering.spacing import box_intervals
-from bavs_jax.training.batches import make_pixel_table, training_pixels
-from bavs_jax.training.objectives import (
+from bavs_jax.models.objectives import (
     make_colour_objective,
     make_flow_objective,
     make_variance_objective,
 )
+from bavs_jax.models.ray_field import RayField, RayTraining
+from bavs_jax.pixel_table import make_pixel_table, training_pixels
+from bavs_jax.rendering.proposals import make_proposal_sampler
+from bavs_jax.rendering.samplers import make_occupancy_sampler
+from bavs_jax.rendering.sampling import make_march_options
+from bavs_jax.rendering.spacing import box_intervals
 from bavs_jax.training.train import init_train_state, make_train_fn
 from bavs_jax.uncertainty.channel import vertex_variance
 from bavs_jax.uncertainty.predictive import make_predictive_fn
@@ -40,24 +41,14 @@ NUM_RAYS, CAPACITY, CHUNK = 64, 4096, 128
 HASH = {"num_levels": 2, "coarsest": 4, "finest": 8, "width": 8, "direction_degree": 1}
 
 
-def gradient(trained, sampler, objective, mesh, table, mask):
+def gradient(model, mesh, table, mask):
     """Of one step: what plain descent with a rate of 1 takes away; and the start's parameters."""
     optimiser = optax.sgd(1.0)
-    train = make_train_fn(
-        trained,
-        sampler,
-        objective,
-        optimiser,
-        lambda step: 1.0,
-        num_rays=NUM_RAYS,
-        penalty_weight=0.1,
-        steps_per_call=1,
-        mesh=mesh,
-    )
-    state = init_train_state(jax.random.key(0), trained, sampler, optimiser)
-    before = jax.tree.map(np.asarray, state.params)
+    train = make_train_fn(model, optimiser, lambda step: 1.0, steps_per_call=1, mesh=mesh)
+    state = init_train_state(jax.random.key(0), model, optimiser)
+    before = jax.tree.map(np.asarray, state.model.params)
     state, info = train(jax.random.key(1), put_on_all(state, mesh), table, mask)
-    after = jax.tree.map(np.asarray, state.params)
+    after = jax.tree.map(np.asarray, state.model.params)
     gradients = jax.tree.map(np.subtract, before, after)
     flat = np.concatenate([x.ravel() for x in jax.tree.leaves(gradients)])
     return flat, np.array([float(info.loss), float(info.rays), float(info.samples)]), state
@@ -95,43 +86,41 @@ def main(out):
         ),
     }
     found = {}
-    for name, (trained, its_sampler, objective) in jobs.items():
-        values = gradient(trained, its_sampler, objective, mesh, table, mask)
-        found[f"{name}_gradient"], found[f"{name}_info"], state = values
-        if name == "colour":
-            train_state = state
+    models = {
+        name: RayField(
+            trained,
+            its_sampler,
+            background=scene.background,
+            box=scene.box,
+            training=RayTraining(objective, num_rays=NUM_RAYS, penalty_weight=0.1),
+            **shared,
+        )
+        for name, (trained, its_sampler, objective) in jobs.items()
+    }
+    states = {}
+    for name, model in models.items():
+        values = gradient(model, mesh, table, mask)
+        found[f"{name}_gradient"], found[f"{name}_info"], states[name] = values
 
     grid = DeformationGrid(jnp.asarray(scene.box), 2)
-    curvature_fn = make_curvature_fn(
-        field, sampler, grid, background=scene.background, chunk_samples=256, mesh=mesh
-    )
-    trained = train_state.params, train_state.sampler_state
+    model, trained = models["colour"], states["colour"].model
+    curvature_fn = make_curvature_fn(model, grid, chunk_samples=256, mesh=mesh)
     pixels = table_rays(table, *training_pixels(table, mask), "eq13")
-    curvature = curvature_fn(*trained, **pixels)[0]
+    curvature = curvature_fn(trained, **pixels)[0]
     found["curvature"] = np.asarray(curvature)
     variance = vertex_variance(
         curvature, num_rays=100, prior_weight=1e-4, weighting="eq13", variant="posterior"
     )
-    render_chunk = make_render_chunk_fn(
-        field,
-        sampler,
-        grid,
-        **shared,
-        background=scene.background,
-        variant="posterior",
-        scale="log",
-    )
+    render_chunk = make_render_chunk_fn(model, grid, variant="posterior", scale="log", mesh=mesh)
     found["scores"] = mean_uncertainty(
-        lambda rays: render_chunk(*trained, variance, rays),
+        lambda rays: render_chunk(trained, variance, rays),
         take(scene.cameras, np.arange(4, scene.num_views)),
         chunk=CHUNK,
     )
     found["chosen"] = np.argsort(-found["scores"], kind="stable")[:3]
-    predictive = make_predictive_fn(
-        field, sampler, grid, background=scene.background, chunk_samples=256, mesh=mesh
-    )
+    predictive = make_predictive_fn(model, grid, chunk_samples=256, mesh=mesh)
     found["predictive"] = mean_uncertainty(
-        lambda rays: predictive(*trained, jnp.full((grid.num_vertices, 3), 1e-4), rays),
+        lambda rays: predictive(trained, jnp.full((grid.num_vertices, 3), 1e-4), rays),
         take(scene.cameras, np.arange(4, 6)),
         chunk=CHUNK,
     )

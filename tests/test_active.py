@@ -1,26 +1,24 @@
 """The loop of the paper: rounds, masks, resumption inside a round, captured candidates."""
 
 import dataclasses
-import io
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bavs_jax.active import init_active_state
 from bavs_jax.candidates import (
     captured_candidates,
     dataset_candidates,
     scene_hemisphere,
     with_empty_views,
 )
-from bavs_jax.training.batches import make_pixel_table
+from bavs_jax.pixel_table import make_pixel_table
 from bavs_jax.training.checkpoints import Checkpoints
 from experiments.build import build_problem
 from experiments.build_scene import initial_views, load_config_scene
-from experiments.progress import track
 from experiments.runner import Run, saved_part, whole_state
+from tests.toy_rounds import run_round, silent, start
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 from tests.traces import count_traces
@@ -28,8 +26,8 @@ from tests.traces import count_traces
 # What each kind of source compiles once: no shape in it changes while views grow.
 FIXED_SHAPES = {
     "random": {"train", "top_k", "farthest_ranks", "nearest_distances"},
-    "bavs": {"train", "count_rays", "render_chunk", "pixel_rays", "max_min_filter", "top_k"},
-    "d_optimal": {"train", "count_rays", "top_k"},
+    "bavs": {"train", "count_points", "render_chunk", "pixel_rays", "max_min_filter", "top_k"},
+    "d_optimal": {"train", "count_points", "top_k"},
     "oracle": {"train", "render_chunk", "pixel_rays", "top_k"},
 }
 
@@ -44,35 +42,27 @@ def all_traces():
 
 @pytest.fixture(scope="module")
 def problem(all_traces):
-    config = toy_config()
-    return build_problem(config, load_config_scene(config, cache_dir=None))
+    return make_problem(toy_config())
 
 
-def start(problem, seed=0):
-    initial = initial_views(problem.scene, seed, 2)
-    train = problem.init_train(jax.random.key(seed))
-    return init_active_state(train, problem.table, initial), initial
-
-
-def silent(total, description, unit):
-    """`track` onto a stream that nobody reads."""
-    return track(total, description, unit, stream=io.StringIO())
+def make_problem(config):
+    return build_problem(config, load_config_scene(config, cache_dir=None), track=silent)
 
 
 # One policy for each kind of source; all others differ from one of these by what is rendered.
 @pytest.mark.parametrize("policy", FIXED_SHAPES)
 def test_rounds_add_batches_of_pool_views_and_trace_nothing_new(problem, policy, all_traces):
-    state, initial = start(problem)
-    step = problem.make_step(policy, initial, silent, policy)
+    state, acquisition = start(problem, policy)
     key = jax.random.key(1)
-    state, info = step(key, state)
-    assert info.round == 0 and info.choice is None
-    seen = set(initial.tolist())
+    seen = set(np.flatnonzero(state.is_training_view).tolist())
+    state, choice, _ = run_round(problem, acquisition, key, state)
+    assert int(state.round) == 0 and choice is None
+    assert len(seen) == 2 and set(np.flatnonzero(state.is_training_view).tolist()) == seen
     for number in (1, 2, 3):
         with count_traces() as traces:
-            state, info = step(key, state)
-        picked = set(info.choice.view_ids.tolist())
-        assert info.round == number and len(picked) == 2
+            state, _, view_ids = run_round(problem, acquisition, key, state)
+        picked = set(view_ids.tolist())
+        assert int(state.round) == number and len(picked) == 2
         assert not picked & seen and picked <= set(problem.scene.pool.tolist())
         seen |= picked
         assert set(np.flatnonzero(state.is_training_view).tolist()) == seen
@@ -83,31 +73,32 @@ def test_rounds_add_batches_of_pool_views_and_trace_nothing_new(problem, policy,
     assert traces.count("add_chunk") <= 3
 
 
-def test_a_step_picked_up_half_way_ends_in_the_same_place(problem):
+def test_a_round_picked_up_half_way_ends_in_the_same_place(problem):
     key = jax.random.key(2)
-    state, initial = start(problem)
-    step = problem.make_step("bavs", initial, silent, "bavs")
-    state, _ = step(key, state)
+    state, acquisition = start(problem, "bavs")
+    state, *_ = run_round(problem, acquisition, key, state)
     saved = []
 
     def on_call(state, info):
         saved.append(jax.tree.map(np.asarray, state))
 
-    whole, _ = step(key, jax.tree.map(jnp.copy, state), on_call=on_call)
+    copied = jax.tree.map(jnp.copy, state)
+    whole, choice, _ = run_round(problem, acquisition, key, copied, on_call)
+    assert choice is not None
     half = jax.tree.map(jnp.asarray, saved[2])
     assert int(half.calls) == 3
-    resumed, info = step(key, half)
-    assert info.choice is None
-    jax.tree.map(np.testing.assert_array_equal, resumed.train.params, whole.train.params)
+    resumed, choice, _ = run_round(problem, acquisition, key, half)
+    assert choice is None
+    jax.tree.map(np.testing.assert_array_equal, resumed.train, whole.train)
     np.testing.assert_array_equal(resumed.is_training_view, whole.is_training_view)
 
 
 def test_round_zero_does_not_depend_on_the_policy(problem):
     params = []
     for policy in ("random", "bavs"):
-        state, initial = start(problem)
-        state, _ = problem.make_step(policy, initial, silent, policy)(jax.random.key(3), state)
-        params.append(state.train.params)
+        state, acquisition = start(problem, policy)
+        state, *_ = run_round(problem, acquisition, jax.random.key(3), state)
+        params.append(state.train.model.params)
     jax.tree.map(np.testing.assert_array_equal, *params)
 
 
@@ -171,29 +162,27 @@ def test_captured_pictures_go_into_empty_views_until_these_are_full():
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(problem):
-    state, initial = start(problem)
-    broken = jax.tree.map(lambda x: x * jnp.nan, state.train.params)
+    state, acquisition = start(problem, "random")
+    broken = jax.tree.map(lambda x: x * jnp.nan, state.train.last_params)
     state = state.replace(train=state.train.replace(last_params=broken))
-    step = problem.make_step("random", initial, silent, "random")
     with pytest.raises(FloatingPointError, match="round 0, training call 0: the loss is nan"):
-        step(jax.random.key(0), state)
+        run_round(problem, acquisition, jax.random.key(0), state)
 
 
 def test_hemisphere_pictures_are_taken_trained_on_and_survive_a_checkpoint(tmp_path):
     config = toy_config(candidates__source="hemisphere", candidates__hemisphere_draws=9)
-    problem = build_problem(config, load_config_scene(config, cache_dir=None))
-    state, initial = start(problem)
-    step = problem.make_step("bavs", initial, silent, "bavs")
+    problem = make_problem(config)
+    state, acquisition = start(problem, "bavs")
     for _ in range(2):
-        state, info = step(jax.random.key(0), state)
+        state, _, view_ids = run_round(problem, acquisition, jax.random.key(0), state)
     first = problem.scene.num_views
-    assert info.choice.view_ids.tolist() == [first, first + 1]
-    pictures = np.asarray(state.table.pixels[problem.first_empty_row :]).reshape(4, -1)
+    assert view_ids.tolist() == [first, first + 1]
+    pictures = np.asarray(state.table.pixels[len(problem.scene.pixels) :]).reshape(4, -1)
     assert pictures[:2].any(axis=1).all() and not pictures[2:].any()
 
     checkpoints = Checkpoints(tmp_path)
     checkpoints.save(1, saved_part(problem, state), {})
-    saved, _ = checkpoints.restore(saved_part(problem, start(problem)[0]))
+    saved, _ = checkpoints.restore(saved_part(problem, start(problem, "bavs")[0]))
     restored = whole_state(problem, saved)
     jax.tree.map(np.testing.assert_array_equal, restored.table, state.table)
     np.testing.assert_array_equal(restored.is_training_view, state.is_training_view)
@@ -203,13 +192,14 @@ def test_training_on_keeps_the_field_and_training_anew_does_not():
     losses = {}
     for from_scratch in (True, False):
         config = toy_config(from_scratch=from_scratch, train__random_background=False)
-        problem = build_problem(config, load_config_scene(config, cache_dir=None))
-        state, initial = start(problem)
-        step = problem.make_step("random", initial, silent, "random")
+        problem = make_problem(config)
+        state, acquisition = start(problem, "random")
         first = []
         for _ in range(2):
             calls = []
-            state, _ = step(jax.random.key(0), state, None, lambda s, i, c=calls: c.append(i))
+            state, *_ = run_round(
+                problem, acquisition, jax.random.key(0), state, lambda s, i, c=calls: c.append(i)
+            )
             first.append(float(calls[0].loss))
         losses[from_scratch] = first
     assert losses[True][0] == losses[False][0]

@@ -1,5 +1,6 @@
 """Clean-up by uncertainty: what goes and what stays, the measures, the choice of a threshold."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -11,18 +12,16 @@ from bavs_jax.cameras import Rays
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid, offset_unit
 from bavs_jax.metrics.covered import PixelSums, Sweep, is_empty, pixel_sums, sweep_of
-from bavs_jax.rendering.pixels import render_pixels
 from bavs_jax.uncertainty.channel import vertex_variance
 from bavs_jax.uncertainty.cleanup import (
     choose_threshold,
-    clean_field,
     make_cleaned_render_fn,
     make_point_uncertainty_fn,
     spread_thresholds,
     threshold_sigma,
 )
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
-from tests.toy_fields import even_sampler
+from tests.toy_fields import NOTHING_LEARNT, even_sampler, ray_model
 from tests.traces import count_traces
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -32,7 +31,6 @@ GRID = DeformationGrid(BOX, 4)
 BACKGROUND = np.ones(3, np.float32)
 FLOATER, RADIUS = np.array([-0.5, 0.0, 0.0]), 0.15
 WALL_FRONT, WALL_BACK = 0.3, 0.6
-PARAMS = {"field": {}, "sampler": {}}
 
 
 def matter(positions):
@@ -56,6 +54,23 @@ FIELD = Field(
 
 
 SAMPLER = even_sampler(near=1.5, far=4.5, num=60)
+MODEL = ray_model(FIELD, SAMPLER, BACKGROUND, capacity=100_000)
+
+
+def cleaned(field: Field, uncertainty_fn, threshold) -> Field:
+    """The definition of what is cleaned: `sigma(x) [u(x) <= threshold]`, all else as it was."""
+
+    def kept(positions, density):
+        return jnp.where(uncertainty_fn(positions) > threshold, 0.0, density)
+
+    def apply(params, positions, directions, **inputs):
+        density, *rest = field.apply(params, positions, directions, **inputs)
+        return kept(positions, density), *rest
+
+    def density(params, positions, **inputs):
+        return kept(positions, field.density(params, positions, **inputs))
+
+    return field._replace(apply=apply, density=density)
 
 
 def rays_between(starts, ends) -> Rays:
@@ -89,10 +104,8 @@ def variance():
 
     @jax.jit
     def raw_sum(rays):
-        samples, _ = SAMPLER.sample(None, {}, {}, rays)
-        zero = jnp.zeros((GRID.num_vertices, 3))
-        field_fn = partial(FIELD.apply, {})
-        return add_jac_sq_sum(zero, field_fn, GRID, rays, samples, background=BACKGROUND)
+        terms = MODEL.ray_terms(NOTHING_LEARNT, rays, most_points=MODEL.most_points)
+        return add_jac_sq_sum(jnp.zeros((GRID.num_vertices, 3)), terms, GRID)
 
     return vertex_variance(
         raw_sum(rays),
@@ -105,14 +118,13 @@ def variance():
 
 @pytest.fixture(scope="module")
 def cleaned_fn():
-    options = {"background": BACKGROUND, "capacity": 100_000, "variant": "posterior"}
-    return make_cleaned_render_fn(FIELD, SAMPLER, GRID, **options)
+    return make_cleaned_render_fn(MODEL, GRID, variant="posterior")
 
 
 @pytest.fixture(scope="module")
 def render(cleaned_fn, variance):
     return lambda thresholds, rays: jax.tree.map(
-        np.asarray, cleaned_fn(PARAMS, {}, variance, jnp.asarray(thresholds), rays)
+        np.asarray, cleaned_fn(NOTHING_LEARNT, variance, jnp.asarray(thresholds), rays)
     )
 
 
@@ -168,14 +180,11 @@ def test_an_infinite_threshold_changes_no_bit(render, variance):
 
     @jax.jit
     def plain(rays):
-        options = {"background": BACKGROUND, "capacity": 100_000}
-        return render_pixels(FIELD, SAMPLER, PARAMS, {}, rays, **options)[0]
+        return MODEL.render(NOTHING_LEARNT, rays)
 
     @jax.jit
     def wrapped(rays, threshold):
-        field = clean_field(FIELD, make_uncertainty_fn(variance), threshold)
-        options = {"background": BACKGROUND, "capacity": 100_000}
-        return render_pixels(field, SAMPLER, PARAMS, {}, rays, **options)[0]
+        return cleaned_model(variance, threshold).render(NOTHING_LEARNT, rays)
 
     want, swept = plain(rays), render([0.4, np.inf], rays)
     for name in ("rgb", "depth", "opacity"):
@@ -188,16 +197,19 @@ def make_uncertainty_fn(variance):
     return make_point_uncertainty_fn(GRID, variance, variant="posterior")
 
 
+def cleaned_model(variance, threshold):
+    field = cleaned(FIELD, make_uncertainty_fn(variance), threshold)
+    return dataclasses.replace(MODEL, field=field)
+
+
 def test_all_thresholds_at_once_are_the_cleaned_field_rendered_for_each(render, variance, chosen):
-    """The definition, `clean_field` through the renderer, against the shared evaluation."""
+    """The definition, `cleaned` through the renderer, against the shared evaluation."""
     sweep, row = chosen
     rays = rays_to_floater(8)
 
     @jax.jit
     def wrapped(threshold):
-        field = clean_field(FIELD, make_uncertainty_fn(variance), threshold)
-        options = {"background": BACKGROUND, "capacity": 100_000}
-        return render_pixels(field, SAMPLER, PARAMS, {}, rays, **options)[0]
+        return cleaned_model(variance, threshold).render(NOTHING_LEARNT, rays)
 
     thresholds = [*sweep.thresholds[[2, row]], np.inf]
     images = render(thresholds, rays)
@@ -211,7 +223,7 @@ def test_cleaned_density_is_zero_above_the_threshold_alone(variance):
     points = jax.random.uniform(jax.random.key(2), (200, 3), minval=-1.0, maxval=1.0)
     uncertainty = make_uncertainty_fn(variance)(points)
     threshold = float(jnp.median(uncertainty))
-    field = clean_field(FIELD, make_uncertainty_fn(variance), threshold)
+    field = cleaned(FIELD, make_uncertainty_fn(variance), threshold)
     want = np.where(uncertainty > threshold, 0.0, matter(points))
     np.testing.assert_array_equal(field.density({}, points), want)
     np.testing.assert_array_equal(field.apply({}, points, points)[0], want)
@@ -225,7 +237,7 @@ def test_a_sweep_compiles_once(cleaned_fn, render, variance):
     with count_traces() as traces:
         for low in (0.3, 0.5, 0.7):
             render([low, low + 0.1, np.inf], rays)
-        jax.block_until_ready(cleaned_fn(PARAMS, {}, 2.0 * variance, jnp.arange(3.0), rays))
+        jax.block_until_ready(cleaned_fn(NOTHING_LEARNT, 2.0 * variance, jnp.arange(3.0), rays))
     assert "render" not in traces
 
 

@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 
 from bavs_jax import cameras as cams
+from bavs_jax.cameras import project
 from bavs_jax.fields import contraction, deformation, encodings, positional
-from bavs_jax.projection import project
+from bavs_jax.pixel_table import view_pixel_rays
 from bavs_jax.rendering import compositing, histograms, sampling
 from bavs_jax.scenes import procedural, sculpture, sdf, sdf_surface
 from bavs_jax.selection.directional import same_side
 from bavs_jax.selection.distances import pairwise_distances
 from bavs_jax.selection.policies.distance import great_circle
-from bavs_jax.training.batches import view_pixel_rays
 from bavs_jax.uncertainty import curvature, measures, warp
 
 SIZES = (1_000, 10_923, 16_384, 20_000, 32_768, 43_680, 50_000)

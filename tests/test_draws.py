@@ -11,7 +11,6 @@ import pytest
 from bavs_jax.cameras import Rays
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid
-from bavs_jax.rendering.pixels import render_pixels
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 from bavs_jax.uncertainty.draws import (
     colour_spread,
@@ -21,7 +20,14 @@ from bavs_jax.uncertainty.draws import (
 )
 from bavs_jax.uncertainty.posterior import default_prior_weight, posterior_precision
 from experiments.posthoc.draws import ViewDraws, farthest_view, largest_offset, spread_measures
-from tests.toy_fields import even_sampler, rays_through, smooth_field, smooth_field_fn
+from tests.toy_fields import (
+    NOTHING_LEARNT,
+    even_sampler,
+    ray_model,
+    rays_through,
+    smooth_field,
+    smooth_field_fn,
+)
 from tests.toy_scenes import toy_scene
 from tests.traces import count_traces
 
@@ -30,8 +36,8 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 BOX = jnp.array([[-1.0] * 3, [1.0] * 3])
 GRID = DeformationGrid(BOX, 2)
 SAMPLER = even_sampler(near=1.5, far=4.5, num=24)
-PARAMS = {"field": {}, "sampler": {}}
-OPTIONS = {"background": np.ones(3, np.float32), "capacity": 10_000}
+BACKGROUND = np.ones(3, np.float32)
+SMOOTH = ray_model(smooth_field(), SAMPLER, BACKGROUND)
 KEY = jax.random.key(3)
 
 
@@ -84,15 +90,12 @@ def test_noise_scale_gives_the_posterior_of_noisy_pixels():
 
 @pytest.fixture(scope="module")
 def displaced():
-    render = make_displaced_render_fn(smooth_field(), SAMPLER, GRID, **OPTIONS)
-    return partial(render, PARAMS, {})
+    return partial(make_displaced_render_fn(SMOOTH, GRID), NOTHING_LEARNT)
 
 
 def test_no_offset_is_the_plain_render_to_the_last_bit(displaced):
     rays = rays_through(KEY, 12)
-    plain = jax.jit(
-        lambda rays: render_pixels(smooth_field(), SAMPLER, PARAMS, {}, rays, **OPTIONS)[0]
-    )(rays)
+    plain = jax.jit(lambda rays: SMOOTH.render(NOTHING_LEARNT, rays))(rays)
     got = displaced(jnp.zeros((GRID.num_vertices, 3)), rays)
     for name in ("rgb", "depth", "opacity"):
         np.testing.assert_array_equal(got[name], getattr(plain, name))
@@ -106,7 +109,7 @@ def test_one_offset_everywhere_is_a_shifted_field(displaced):
         apply=lambda params, x, d: smooth_field_fn(x + offset, d),
         density=lambda params, x: smooth_field_fn(x + offset, x)[0],
     )
-    want = render_pixels(shifted, SAMPLER, PARAMS, {}, rays, **OPTIONS)[0]
+    want = ray_model(shifted, SAMPLER, BACKGROUND).render(NOTHING_LEARNT, rays)
     got = displaced(jnp.tile(offset, (GRID.num_vertices, 1)), rays)
     # Trilinear weights sum to 1 up to float32.
     np.testing.assert_allclose(got["rgb"], want.rgb, atol=1e-5)
@@ -186,24 +189,22 @@ def spread_of_side():
     """Colour spread over draws [R] of rays from a side, where only +1 was photographed."""
     rays, noise = rays_from(1.0), 0.02
     grid = DeformationGrid(BOX, 3)
+    model = ray_model(BALL, SAMPLER, BACKGROUND)
 
     @jax.jit
     def raw_sum(rays):
-        samples, _ = SAMPLER.sample(None, {}, {}, rays)
-        zero = jnp.zeros((grid.num_vertices, 3))
-        field_fn = partial(BALL.apply, {})
-        background = OPTIONS["background"]
-        return add_jac_sq_sum(zero, field_fn, grid, rays, samples, background=background)
+        terms = model.ray_terms(NOTHING_LEARNT, rays, most_points=model.most_points)
+        return add_jac_sq_sum(jnp.zeros((grid.num_vertices, 3)), terms, grid)
 
     num_rays = len(rays.origins)
     prior_weight = default_prior_weight(3)
     precision = posterior_precision(raw_sum(rays), num_rays=num_rays, prior_weight=prior_weight)
     scale = noise_scale(noise**2, num_rays)
     thetas = draw_offsets(KEY, precision, 12, scale=scale, limit=0.25)
-    render = make_displaced_render_fn(BALL, SAMPLER, grid, **OPTIONS)
+    render = make_displaced_render_fn(model, grid)
 
     def spread(side):
-        rgb = [render(PARAMS, {}, theta, rays_from(side))["rgb"] for theta in thetas]
+        rgb = [render(NOTHING_LEARNT, theta, rays_from(side))["rgb"] for theta in thetas]
         return np.asarray(colour_spread(jnp.stack(rgb)))
 
     return spread, noise

@@ -22,13 +22,13 @@ from bavs_jax.export.field import (
 from bavs_jax.export.formats import ExportError, import_extra, nrrd_bytes, ply_bytes
 from bavs_jax.export.mesh import default_threshold, extract_mesh, without_small_parts
 from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.pixel_table import make_pixel_table, view_pixel_rays
 from bavs_jax.rendering.render import render_rays
 from bavs_jax.rendering.sampling import Samples
 from bavs_jax.scenes.poses import scene_points, user_points, user_units
-from bavs_jax.training.batches import make_pixel_table, view_pixel_rays
 from bavs_jax.uncertainty.channel import make_uncertainty_channel
 from bavs_jax.uncertainty.points import make_point_fn
-from tests.toy_fields import smooth_field, smooth_field_fn
+from tests.toy_fields import NOTHING_LEARNT, even_sampler, ray_model, smooth_field, smooth_field_fn
 from tests.toy_scenes import toy_scene
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -38,6 +38,8 @@ RNG = np.random.default_rng(0)
 TURNED = np.array(  # 2 times a quarter turn about z, and a shift
     [[0.0, -2.0, 0.0, 10.0], [2.0, 0.0, 0.0, 20.0], [0.0, 0.0, 2.0, 30.0], [0.0, 0.0, 0.0, 1.0]]
 )
+SAMPLER = even_sampler(near=1.0, far=2.0, num=1)
+MODEL = ray_model(smooth_field(), SAMPLER, None, box=BOX)
 
 
 # --- point queries ---
@@ -79,8 +81,8 @@ def test_a_point_is_what_the_renderer_composites(grid, variance, variant):
         exact=True,
         channels={"uncertainty": channel},
     )
-    point_fn = make_point_fn(smooth_field(), grid, variant=variant, chunk=4)
-    got = point_fn({}, variance, points, directions=directions)
+    point_fn = make_point_fn(MODEL, grid, variant=variant, chunk=4)
+    got = point_fn(NOTHING_LEARNT, variance, points, directions=directions)
     # The renderer's positions are origin + 1.5 direction, off by float32 rounding.
     np.testing.assert_allclose(got["sigma"], rendered.channels["uncertainty"], rtol=1e-5)
     np.testing.assert_allclose(got["rgb"], rendered.rgb, atol=1e-5)
@@ -90,39 +92,42 @@ def test_a_point_is_what_the_renderer_composites(grid, variance, variant):
 @pytest.mark.parametrize("num", [0, 1, 4, 9])
 def test_any_number_of_points_with_progress(grid, variance, num):
     done, points = [], in_box(num)
-    point_fn = make_point_fn(smooth_field(), grid, variant="posterior", chunk=4)
-    got = point_fn({}, variance, points, directions=[0.0, 0.0, 1.0], progress_fn=done.append)
+    point_fn = make_point_fn(MODEL, grid, variant="posterior", chunk=4)
+    got = point_fn(
+        NOTHING_LEARNT, variance, points, directions=[0.0, 0.0, 1.0], progress_fn=done.append
+    )
     assert sum(done) == num and got["rgb"].shape == (num, 3)
     expected = smooth_field_fn(points, np.tile(np.float32([0.0, 0.0, 1.0]), (num, 1)))
     np.testing.assert_allclose(got["density"], expected[0], rtol=1e-5)
     np.testing.assert_allclose(got["rgb"], expected[1], rtol=1e-5)
-    assert point_fn({}, variance, points).keys() == {"density", "sigma"}
+    assert point_fn(NOTHING_LEARNT, variance, points).keys() == {"density", "sigma"}
 
 
 def test_colour_over_several_directions_is_their_mean(grid, variance):
-    point_fn = make_point_fn(smooth_field(), grid, variant="posterior", chunk=4)
+    point_fn = make_point_fn(MODEL, grid, variant="posterior", chunk=4)
     points, looks = in_box(6), np.eye(3)
-    got = point_fn({}, variance, points, directions=looks[:, None])["rgb"]
-    single = [point_fn({}, variance, points, directions=look)["rgb"] for look in looks]
+    got = point_fn(NOTHING_LEARNT, variance, points, directions=looks[:, None])["rgb"]
+    single = [point_fn(NOTHING_LEARNT, variance, points, directions=look)["rgb"] for look in looks]
     np.testing.assert_allclose(got, np.mean(single, axis=0), rtol=1e-5)
 
 
 def test_outside_of_a_bounded_scene_there_is_nothing(grid, variance):
     points = np.array([[0.0, 0.0, 0.6], [0.0, 0.0, 0.4]])
-    point_fn = make_point_fn(smooth_field(), grid, variant="posterior")
-    assert (point_fn({}, variance, points)["density"] > 0).tolist() == [False, True]
-    everywhere = make_point_fn(smooth_field(), grid.replace(contracted=True), variant="posterior")
-    assert (everywhere({}, variance, points)["density"] > 0).all()
+    point_fn = make_point_fn(MODEL, grid, variant="posterior")
+    assert (point_fn(NOTHING_LEARNT, variance, points)["density"] > 0).tolist() == [False, True]
+    unbounded = dataclasses.replace(MODEL, box=None)
+    everywhere = make_point_fn(unbounded, grid.replace(contracted=True), variant="posterior")
+    assert (everywhere(NOTHING_LEARNT, variance, points)["density"] > 0).all()
 
 
 def test_wrong_arguments_of_point_queries(grid, variance):
     with pytest.raises(ValueError, match="use one of posterior, bayesrays"):
-        make_point_fn(smooth_field(), grid, variant="x")
-    point_fn = make_point_fn(smooth_field(), grid, variant="posterior")
+        make_point_fn(MODEL, grid, variant="x")
+    point_fn = make_point_fn(MODEL, grid, variant="posterior")
     with pytest.raises(ValueError, match=r"positions: have the shape \(3,\)"):
-        point_fn({}, variance, np.zeros(3))
+        point_fn(NOTHING_LEARNT, variance, np.zeros(3))
     with pytest.raises(ValueError, match=r"directions: have the shape \(2, 3\)"):
-        point_fn({}, variance, np.zeros((4, 3)), directions=np.zeros((2, 3)))
+        point_fn(NOTHING_LEARNT, variance, np.zeros((4, 3)), directions=np.zeros((2, 3)))
 
 
 def test_points_to_the_users_coordinates_and_back():

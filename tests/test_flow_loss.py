@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import gaussian_kde
 
 from bavs_jax.fields.flow_field import base_draws, make_flow_field
-from bavs_jax.training.losses import (
+from bavs_jax.models.losses import (
     colour_likelihood_loss,
     flow_loss,
     kernel_bandwidth,

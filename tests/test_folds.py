@@ -11,9 +11,9 @@ import pytest
 
 from bavs_jax.cameras import image_pixels, look_at, make_cameras, pixel_rays
 from bavs_jax.lenses import rising_radii
+from bavs_jax.pixel_table import make_pixel_table, sample_pixels
 from bavs_jax.scenes import SceneError, load_nerfstudio
 from bavs_jax.scenes.folds import LARGEST_MISS, shown_pixels
-from bavs_jax.training.batches import make_pixel_table, sample_pixels
 from experiments.evaluate import mean_quality
 from tests.scene_files import edit_json, write_nerfstudio
 from tests.test_cameras import project

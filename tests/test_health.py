@@ -9,17 +9,25 @@ import numpy as np
 import pytest
 
 from bavs_jax import active
-from bavs_jax.candidates import dataset_candidates
-from bavs_jax.selection.policies import get_policy
-from bavs_jax.training.batches import make_pixel_table
-from bavs_jax.training.fit import MAX_RESTARTS, check_call, colour_spread, fit, is_stuck
+from bavs_jax.models.base import ModelState
+from bavs_jax.pixel_table import make_pixel_table
+from bavs_jax.training.fit import (
+    MAX_RESTARTS,
+    Trainer,
+    check_call,
+    colour_spread,
+    fit,
+    is_stuck,
+)
 from bavs_jax.training.train import TrainInfo, TrainState
 from bavs_jax.uncertainty.model import Situation
-from experiments.build_trainer import Trainer, train_aside
+from experiments.build import build_problem
+from experiments.build_trainer import train_aside
 from experiments.progress import track
 from experiments.report.results import Run
 from experiments.report.tables import final_table
 from experiments.suggest.training import train_field
+from tests.toy_rounds import run_round
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 
@@ -69,44 +77,34 @@ def make_calls(losses):
 
     def call(key, train, table, is_training_view):
         keys.append(jax.random.key_data(key).tolist())
-        return train.replace(step=train.step + 1), report(losses[int(train.params)])
+        return train.replace(step=train.step + 1), report(losses[int(train.model.params)])
 
     return init, call, inits, keys
 
 
-def make_step(losses, scene):
-    """A step whose training calls only report."""
+def make_problem(losses):
+    """A problem whose training calls only report."""
     init, call, inits, keys = make_calls(losses)
-    stages = active.Stages(call, init, lambda key, train: train, None)
-    step = active.make_active_step(
-        get_policy("random"),
-        stages,
-        dataset_candidates(scene),
-        centre=scene.centre,
-        batch_size=1,
-        calls_per_round=CALLS,
-        check_call=CHECK,
-        num_rays=64,
-    )
-    return step, inits, keys
+    return SimpleNamespace(trainer=Trainer(init, call, CALLS, CHECK)), inits, keys
 
 
 def fresh(attempt):
-    return TrainState(jnp.int32(0), jnp.int32(attempt), jnp.int32(attempt), (), ())
+    return TrainState(jnp.int32(0), ModelState(jnp.int32(attempt), ()), jnp.int32(attempt), ())
 
 
 def run(losses):
     scene = toy_scene(num_views=4, num_test=1)
-    step, inits, keys = make_step(losses, scene)
-    state = active.init_active_state(fresh(0), make_pixel_table(scene), [0, 1])
+    problem, inits, keys = make_problem(losses)
+    state = active.init(fresh(0), make_pixel_table(scene), [0, 1])
     seen = []
-    state, _ = step(jax.random.key(0), state, on_call=lambda s, _: seen.append(s))
+    # A round that is not trained yet is opened by no choice.
+    state, *_ = run_round(problem, None, jax.random.key(0), state, lambda s, _: seen.append(s))
     return state, inits, keys, seen
 
 
 def test_a_stuck_field_begins_anew_with_another_key():
     state, inits, keys, seen = run([1.0, 0.001])
-    assert (int(state.calls), int(state.restarts), int(state.train.params)) == (CALLS, 1, 1)
+    assert (int(state.calls), int(state.restarts), int(state.train.model.params)) == (CALLS, 1, 1)
     assert int(state.train.step) == CALLS and len(keys) == CHECK + CALLS
     assert len(inits) == 1 and len({tuple(k) for k in keys}) == len(keys)
     assert [int(s.restarts) for s in seen] == [0] * (CHECK - 1) + [1] * (CALLS + 1)
@@ -125,11 +123,10 @@ def test_restarts_are_bounded():
 
 
 def test_a_round_that_was_restarted_goes_on_from_a_checkpoint_alike():
-    scene = toy_scene(num_views=4, num_test=1)
     _, _, whole, seen = run([1.0, 0.001])
     half = seen[CHECK + 1]  # two calls into the second attempt
-    step, inits, rest = make_step([1.0, 0.001], scene)
-    state, _ = step(jax.random.key(0), half)
+    problem, inits, rest = make_problem([1.0, 0.001])
+    state, *_ = run_round(problem, None, jax.random.key(0), half)
     assert not inits and rest == whole[-len(rest) :] and len(rest) == CALLS - 2
     assert int(state.restarts) == 1
 
@@ -138,7 +135,16 @@ class KilledError(Exception):
     pass
 
 
-LONG = {"train__num_steps": 1024, "train__steps_per_call": 128}  # looked at after 2 of 8 calls
+LONG = {"train__num_steps": 1024, "train__steps_per_call": 128}
+LONG_CALLS = (8, 2)  # so many calls, looked at after so many
+
+
+def test_a_config_says_how_many_calls_there_are_and_when_a_field_is_looked_at():
+    scene = toy_scene(num_views=4, num_test=1)
+    for options, calls in ((LONG, LONG_CALLS), ({"train__num_steps": 9}, (3, None))):
+        problem = build_problem(toy_config(**options), scene)
+        for trainer in problem.trainers.values():
+            assert (trainer.num_calls, trainer.check_call) == calls
 
 
 def test_a_capture_whose_field_was_stuck_goes_on_with_its_count_after_a_kill(tmp_path, capsys):
@@ -161,9 +167,7 @@ def test_a_capture_whose_field_was_stuck_goes_on_with_its_count_after_a_kill(tmp
         problem = SimpleNamespace(
             scene=scene,
             table=make_pixel_table(scene),
-            init_train=init_train,
-            train_call=cut_call,
-            calls_per_round=8,
+            trainer=Trainer(init_train, cut_call, *LONG_CALLS),
         )
         if last:
             with pytest.raises(KilledError):
@@ -172,7 +176,7 @@ def test_a_capture_whose_field_was_stuck_goes_on_with_its_count_after_a_kill(tmp
         ends[name] = state, [key for key in keys if key]
     (whole, whole_keys), (cut, cut_keys) = ends["whole"], ends["cut"]
     assert cut_keys == whole_keys and len(whole_keys) == 2 + 8
-    assert int(cut.params) == int(whole.params) == 1
+    assert int(cut.model.params) == int(whole.model.params) == 1
     assert "the field is stuck: trained anew with another key (1)" in capsys.readouterr().err
 
 
@@ -181,11 +185,11 @@ def test_a_field_trained_aside_begins_anew_and_says_so(capsys):
     init, call, inits, keys = make_calls([9.0, 1.0, 0.001])  # the first `init` is no restart
     is_training = np.array([True, True, False, False, False])
     situation = Situation(fresh(0), make_pixel_table(scene), is_training, 0, label="toy")
-    trainer = Trainer(None, None, init, call, None)
+    trainer = Trainer(init, call, *LONG_CALLS)
     state = train_aside(
         toy_config(**LONG), trainer, jax.random.key(0), situation, "variance", track
     )
-    assert int(state.params) == 2 and int(state.step) == 8 and len(keys) == 2 + 8
+    assert int(state.model.params) == 2 and int(state.step) == 8 and len(keys) == 2 + 8
     assert len({tuple(key) for key in keys}) == 10 and len(inits) == 2
     assert "toy: the variance field is stuck: trained anew with another key (1)" in (
         capsys.readouterr().err
@@ -200,12 +204,9 @@ def test_training_that_is_picked_up_goes_the_same_way_and_a_bad_loss_ends_it():
         init, call, _, keys = make_calls(losses)
         parts = fit(
             jax.random.key(3),
-            init,
-            call,
+            Trainer(init, call, CALLS, CHECK),
             fresh(begin.get("restarts", 0)),
             *where,
-            num_calls=CALLS,
-            check_call=CHECK,
             label="toy",
             **begin,
         )

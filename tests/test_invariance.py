@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import io
 
 import jax
 import jax.numpy as jnp
@@ -14,21 +13,22 @@ from bavs_jax.candidates import dataset_candidates
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid, offset_unit
 from bavs_jax.fields.flow_field import FlowField
+from bavs_jax.models.base import ModelState
+from bavs_jax.pixel_table import make_pixel_table
+from bavs_jax.policy_inputs import InputMaker, LookOptions
 from bavs_jax.scenes.poses import transform_poses
 from bavs_jax.selection.batch import acquire
 from bavs_jax.selection.context import make_context
 from bavs_jax.selection.policies import POLICIES
-from bavs_jax.sources import SourceOptions, make_sources_fn
-from bavs_jax.training.batches import make_pixel_table
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.images import make_image_fn
 from bavs_jax.uncertainty.measures import make_true_error_fn
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE, Situation
 from bavs_jax.uncertainty.models import MODELS
-from bavs_jax.uncertainty.streaming import make_curvature_fn
+from bavs_jax.uncertainty.streaming import CurvatureOfRays
 from experiments.build import build_problem
-from experiments.progress import track
 from tests.toy_fields import even_sampler
+from tests.toy_rounds import silent
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 
@@ -76,7 +76,7 @@ def toy_train(kind, key, situation):
     del kind, situation
     phase = 0.3 * jax.random.normal(key)
     params = {"field": {"phase": phase}, "sampler": {}}
-    return TrainState(jnp.int32(0), params, params, None, {})
+    return TrainState(jnp.int32(0), ModelState(params, {}), params, None)
 
 
 def random_scene():
@@ -110,27 +110,21 @@ class World:
     def __init__(self, name, unbounded):
         similarity = SIMILARITIES[name]
         self.scene = scene = moved_scene(similarity, unbounded)
-        toolbox = build_problem(toy_config(), scene).make_toolbox(self.track)
+        toolbox = build_problem(toy_config(), scene, track=silent).toolbox
         sampler = even_sampler(near=scene.near, far=scene.far, num=32)
         fields, flow = toy_fields(similarity)
-        curvature_fn = make_curvature_fn(
-            fields[RECONSTRUCTION], sampler, toolbox.grid, background=toolbox.background
+        models = {
+            kind: dataclasses.replace(toolbox.models[kind], field=field, sampler=sampler)
+            for kind, field in fields.items()
+        }
+        curvature = CurvatureOfRays(
+            models[RECONSTRUCTION],
+            toolbox.grid,
+            group_size=toolbox.curvature.group_size,
+            track=silent,
         )
-
-        def curvature(state, rays, label, *, weighting, group_ids=None, **of_rays):
-            del label, weighting
-            sums = curvature_fn(
-                state.params,
-                state.sampler_state,
-                rays,
-                group_ids=group_ids,
-                num_groups=toolbox.group_size,
-                **of_rays,
-            )
-            return sums[0] if group_ids is None else sums
-
         self.toolbox = toolbox = toolbox._replace(
-            fields={kind: (field, sampler) for kind, field in fields.items()},
+            models=models,
             flow=flow,
             curvature=curvature,
             train=toy_train,
@@ -138,19 +132,15 @@ class World:
             chunk=256,
         )
         render = make_image_fn(toolbox, RECONSTRUCTION)
-        self.sources = make_sources_fn(
+        self.inputs = InputMaker(
             toolbox,
-            {n: functools.cache(functools.partial(m.make_fns, toolbox)) for n, m in MODELS.items()},
-            SourceOptions(image_scale=1.0, chunk=256),
-            track=self.track,
+            functools.cache(lambda name: MODELS[name].make_fns(toolbox)),
+            LookOptions(image_scale=1.0, chunk=256),
+            track=silent,
             true_error_fn=make_true_error_fn(
                 lambda state: functools.partial(render, state), scene, image_scale=1.0, chunk=256
             ),
         )
-
-    @staticmethod
-    def track(total, description, unit):
-        return track(total, description, unit, stream=io.StringIO())
 
     def choose(self, policy):
         """The chosen views, and the scores of the first pick, the largest being 1."""
@@ -165,7 +155,7 @@ class World:
             training_positions=table.cameras.positions,
             is_training_view=is_training,
             centre=self.scene.centre,
-            **self.sources(policy, KEY, situation, candidates).fields,
+            **self.inputs(policy, KEY, situation, candidates).fields,
         )
         selected, info = acquire(policy, KEY, context, BATCH)
         scores = info.scores[np.isfinite(info.scores)]

@@ -1,23 +1,21 @@
 """The whole loop on every kind of field and sampler, bounded and unbounded."""
 
 import dataclasses
-import io
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bavs_jax.active import init_active_state
 from bavs_jax.fields.hash_grid import make_hash_grid_field
+from bavs_jax.pixel_table import make_pixel_table
 from bavs_jax.rendering.samplers import dense_samples
-from bavs_jax.training.batches import make_pixel_table
 from experiments.build import build_problem
-from experiments.build_scene import initial_views
-from experiments.build_trainer import KINDS, build_trainer
+from experiments.build_field import build_flow
+from experiments.build_trainer import KINDS, build_model, build_trainer
 from experiments.errors import ConfigError
-from experiments.progress import track
 from tests.toy_fields import rays_through
+from tests.toy_rounds import run_round, silent, start
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 from tests.traces import count_traces
@@ -47,11 +45,7 @@ TINY = {
 def tiny_problem(unbounded, **overrides):
     scene = dataclasses.replace(toy_scene(), unbounded=unbounded)
     config = toy_config(loader="blender", **TINY, **overrides)
-    return build_problem(config, scene)
-
-
-def silent(total, description, unit):
-    return track(total, description, unit, stream=io.StringIO())
+    return build_problem(config, scene, track=silent)
 
 
 @pytest.mark.parametrize(
@@ -64,34 +58,31 @@ def silent(total, description, unit):
 )
 def test_rounds_run_and_trace_nothing_new(unbounded, field_kind, options):
     problem = tiny_problem(unbounded, field_kind=field_kind, **options)
-    initial = initial_views(problem.scene, 0, 2)
-    train = problem.init_train(jax.random.key(0))
-    state = init_active_state(train, problem.table, initial)
-    step = problem.make_step("bavs", initial, silent, "bavs")
-    losses = []
+    state, acquisition = start(problem, "bavs")
+    key, losses = jax.random.key(1), []
 
     def on_call(state, info):
         losses.append(float(info.loss))
 
     with count_traces() as first_traces:
-        state, _ = step(jax.random.key(1), state, on_call=on_call)
+        state, *_ = run_round(problem, acquisition, key, state, on_call)
         assert losses[-1] < 0.7 * losses[0]
-        state, info = step(jax.random.key(1), state)
+        state, *_ = run_round(problem, acquisition, key, state)
     with count_traces() as traces:
-        state, info = step(jax.random.key(1), state)
-    assert info.round == 2 and len(set(info.choice.view_ids.tolist())) == 2
+        state, choice, view_ids = run_round(problem, acquisition, key, state)
+    assert int(state.round) == 2 and len(set(view_ids.tolist())) == 2
     fixed_shapes = {"train", "render_chunk", "add_chunk"}
     assert fixed_shapes <= set(first_traces), "the listener must see these names once"
     assert not set(traces) & fixed_shapes
     assert int(state.is_training_view.sum()) == 6
-    scores = np.asarray(info.choice.selection.scores)[info.choice.selected]
+    scores = np.asarray(choice.selection.scores)[choice.selected]
     assert np.isfinite(scores).all() and (scores > 0).all()
 
 
 def test_every_kind_learns_a_sampler_beside_the_field():
     problem = tiny_problem(True, field_kind="nerf_mlp", sampler_kind="proposal")
-    state = problem.init_train(jax.random.key(0))
-    assert set(state.params) == {"field", "sampler"} and len(state.params["sampler"]) == 2
+    params = problem.trainer.init(jax.random.key(0)).model.params
+    assert set(params) == {"field", "sampler"} and len(params["sampler"]) == 2
 
 
 @pytest.mark.parametrize(
@@ -140,7 +131,8 @@ def test_every_kind_of_training_fits_every_network(field_kind, kind):
     """Shapes alone: a step of training is traced, not compiled."""
     scene = toy_scene()
     config = toy_config(loader="blender", **TINY, field_kind=field_kind)
-    trainer = build_trainer(config, scene, scene.num_views, kind)
+    model = build_model(config, scene, scene.num_views, kind, build_flow(config, scene))
+    trainer = build_trainer(config, model)
     state = jax.eval_shape(trainer.init, KEY)
     table = make_pixel_table(scene)
     after, info = jax.eval_shape(trainer.call, KEY, state, table, np.ones(scene.num_views, bool))

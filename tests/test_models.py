@@ -1,24 +1,22 @@
 """Every uncertainty model on one trained field, through the one renderer."""
 
-import io
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bavs_jax.cameras import take
-from bavs_jax.sources import WEIGHTING, make_candidate_curvature_fn, training_looks
-from bavs_jax.training.batches import view_pixel_rays
-from bavs_jax.training.losses import gaussian_nll
+from bavs_jax.cameras import reduced_cameras, take
+from bavs_jax.models.losses import gaussian_nll
+from bavs_jax.pixel_table import view_pixel_rays
+from bavs_jax.policy_inputs import WEIGHTING, make_candidate_curvature_fn, training_looks
 from bavs_jax.uncertainty.measures import make_true_error_fn
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
 from bavs_jax.uncertainty.models import MODELS, get_model
 from bavs_jax.uncertainty.models.laplace import training_curvature
-from bavs_jax.uncertainty.scoring import mean_uncertainty, reduced_cameras
+from bavs_jax.uncertainty.scoring import mean_uncertainty
 from experiments.build import RENDER_CHUNK, build_problem
 from experiments.build_scene import initial_views, load_config_scene
-from experiments.progress import track
+from tests.toy_rounds import silent
 from tests.toy_runs import toy_config
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -27,15 +25,11 @@ KEY = jax.random.key(5)
 every_model = pytest.mark.parametrize("name", MODELS)
 
 
-def silent(total, description, unit):
-    return track(total, description, unit, stream=io.StringIO())
-
-
 @pytest.fixture(scope="module")
 def trained():
     """A problem, and the situation after a short training on its initial views."""
     config = toy_config(train__num_steps=64, candidates__image_scale=0.5)
-    problem = build_problem(config, load_config_scene(config, cache_dir=None))
+    problem = build_problem(config, load_config_scene(config, cache_dir=None), track=silent)
     initial = initial_views(problem.scene, 0, 4)
     mask = np.zeros(problem.scene.num_views, bool)
     mask[initial] = True
@@ -47,14 +41,14 @@ def trained():
         candidates=take(problem.table.cameras, np.asarray(problem.scene.pool)),
         label="toy",
     )
-    train = problem.make_toolbox(silent).train(RECONSTRUCTION, KEY, situation)
+    train = problem.toolbox.train(RECONSTRUCTION, KEY, situation)
     return problem, situation._replace(train=train)
 
 
 @pytest.fixture(scope="module")
 def fitted_models(trained):
     problem, situation = trained
-    models = {name: problem.model_fns(name, silent) for name in MODELS}
+    models = {name: problem.model_fns(name) for name in MODELS}
     return {name: (fns, fns.fit(KEY, situation)) for name, fns in models.items()}
 
 
@@ -112,14 +106,14 @@ def test_only_coverage_can_be_conditioned_on_picks_and_falls_with_them(trained, 
 
 def test_candidates_add_what_their_photos_would(trained):
     problem, situation = trained
-    toolbox = problem.make_toolbox(silent)
+    toolbox = problem.toolbox
     curvature = make_candidate_curvature_fn(toolbox, situation, situation.candidates, 1.0)
     num_rays = int(problem.scene.offsets[1])
     pixel_ids = np.arange(num_rays, dtype=np.int32)
     for index, added in zip((3, 1), curvature(np.array([3, 1]))):
         views = np.full(num_rays, problem.scene.pool[index], np.int32)
         rays = view_pixel_rays(situation.table.cameras, views, pixel_ids)
-        jac_sq_sum = toolbox.curvature(situation.train, rays, None, weighting=WEIGHTING)
+        jac_sq_sum = toolbox.curvature(situation.train.model, rays, None, weighting=WEIGHTING)
         expected = 2.0 / situation.num_rays * np.asarray(jac_sq_sum)
         assert expected.max() > 0
         # Sums of float32 in another order of rays.
@@ -128,7 +122,7 @@ def test_candidates_add_what_their_photos_would(trained):
 
 def test_looks_of_the_training_views_add_up_to_their_curvature(trained):
     problem, situation = trained
-    toolbox = problem.make_toolbox(silent)
+    toolbox = problem.toolbox
     looks = training_looks(toolbox, situation, 1.0)
     taken = np.flatnonzero(situation.is_training_view)
     positions = np.asarray(situation.table.cameras.positions)[taken]

@@ -33,8 +33,8 @@ def test_every_size_builds(name, size):
     config = load(name, size)
     assert set(config.policies) <= set(POLICIES)
     problem = build_problem(config, toy_scene())
-    train = jax.eval_shape(problem.init_train, jax.random.key(0))
-    assert jax.tree.leaves(train.params)
+    train = jax.eval_shape(problem.trainer.init, jax.random.key(0))
+    assert jax.tree.leaves(train.model.params)
 
 
 @pytest.mark.parametrize("name", SIZED)

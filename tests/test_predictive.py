@@ -9,15 +9,16 @@ import pytest
 
 from bavs_jax.cameras import Rays
 from bavs_jax.fields.deformation import DeformationGrid, displace
+from bavs_jax.models.base import ModelState
 from bavs_jax.rendering.compositing import expected_depth, render_weights
 from bavs_jax.rendering.occupancy import init_occupancy
 from bavs_jax.rendering.samplers import make_occupancy_sampler
 from bavs_jax.rendering.sampling import make_march_options, march, sample_positions
-from bavs_jax.uncertainty.curvature import composited_jacobian, field_slopes
+from bavs_jax.rendering.slopes import colour_jacobian, depth_jacobian, field_slopes
 from bavs_jax.uncertainty.posterior import laplace_variance, offset_variance, posterior_precision
-from bavs_jax.uncertainty.predictive import depth_jacobian, make_predictive_fn, predictive_variance
+from bavs_jax.uncertainty.predictive import make_predictive_fn, predictive_variance
 from tests.oracles_curvature import colours_with_offsets, dense_depth_jacobian, dense_jacobian
-from tests.toy_fields import rays_through, smooth_field, smooth_field_fn
+from tests.toy_fields import ray_model, rays_through, smooth_field, smooth_field_fn
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -46,8 +47,8 @@ def predicted(grid, rays, samples, variance, field_fn=smooth_field_fn):
     """Variances of colour (over all channels) and depth, [R] each."""
     slopes = field_slopes(field_fn, rays, samples)
     background = jnp.asarray(BACKGROUND, samples.deltas.dtype)
-    by_colour, _ = composited_jacobian(slopes, samples.deltas, background=background)
-    by_depth, _ = depth_jacobian(slopes, samples)
+    by_colour, _ = colour_jacobian(slopes, samples.deltas, background=background)
+    by_depth, *_ = depth_jacobian(slopes, samples)
     positions = sample_positions(rays, samples)
     return tuple(predictive_variance(grid, positions, j, variance) for j in (by_colour, by_depth))
 
@@ -111,11 +112,9 @@ def test_buckets_change_nothing_and_empty_rays_are_certain():
     occupancy = sampler.init_state()
     occupied = jax.random.uniform(jax.random.key(3), occupancy.occupied.shape) < 0.5
     occupancy = occupancy.replace(occupied=occupied)
-    params = {"field": {}, "sampler": {}}
-    render = make_predictive_fn(
-        smooth_field(), sampler, grid, background=BACKGROUND, chunk_samples=64
-    )
-    images = render(params, occupancy, variance, rays)
+    state = ModelState({"field": {}, "sampler": {}}, occupancy)
+    model = ray_model(smooth_field(), sampler, BACKGROUND)
+    images = make_predictive_fn(model, grid, chunk_samples=64)(state, variance, rays)
     samples, _ = jax.jit(partial(sampler.sample, None, {}))(occupancy, rays)
     of_colour, of_depth = predicted(grid, rays, samples, variance)
     # The same float32 sums with more empty slots.

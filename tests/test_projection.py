@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bavs_jax.cameras import image_pixels, look_at, make_cameras, pixel_rays
-from bavs_jax.projection import project
+from bavs_jax.cameras import image_pixels, look_at, make_cameras, pixel_rays, project
 from tests import oracles_pixel as oracles
 
 SIZE = (40, 30)

@@ -22,8 +22,13 @@ from bavs_jax.rendering.occupancy import (
 )
 from bavs_jax.rendering.packing import evaluate_all_passes, evaluate_one_pass
 from bavs_jax.rendering.render import Channel, render_rays
-from bavs_jax.rendering.sampling import make_march_options, march, nth_hit, pack_hits
-from bavs_jax.rendering.visible import visible_samples
+from bavs_jax.rendering.sampling import (
+    make_march_options,
+    march,
+    nth_hit,
+    pack_hits,
+    visible_samples,
+)
 from tests.oracles_rendering import march_loop, render_loop, weights_loop
 from tests.toy_fields import rays_through, smooth_field_fn
 

@@ -9,15 +9,17 @@ import pytest
 
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.fields.hash_grid import make_hash_grid_density, make_hash_grid_field
-from bavs_jax.rendering.pixels import basic_images, render_pixels
+from bavs_jax.models.base import ModelState
+from bavs_jax.models.ray_field import RayField
 from bavs_jax.rendering.proposals import make_proposal_sampler
-from bavs_jax.rendering.render import render_rays
+from bavs_jax.rendering.render import basic_images, render_rays
 from bavs_jax.rendering.samplers import make_occupancy_sampler
 from bavs_jax.rendering.sampling import make_march_options
+from bavs_jax.rendering.slopes import depth_jacobian, field_slopes
 from bavs_jax.rendering.spacing import open_intervals
-from bavs_jax.uncertainty.curvature import colour_jacobian, field_slopes, split_colour_jacobian
-from bavs_jax.uncertainty.predictive import depth_jacobian, make_predictive_fn
+from bavs_jax.uncertainty.predictive import make_predictive_fn
 from bavs_jax.uncertainty.streaming import make_curvature_fn
+from tests.oracles_curvature import defined_jacobian, split_jacobian
 from tests.toy_fields import rays_through
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -27,7 +29,7 @@ NUM_RAYS, NUM_VIEWS, CAPACITY = 30, 5, 4096
 
 
 def setting(unbounded, codes):
-    """A field with random parameters, its sampler, parameters, state and background."""
+    """A model with random parameters, and its state."""
     field = make_hash_grid_field(
         BOX,
         num_levels=2,
@@ -53,7 +55,8 @@ def setting(unbounded, codes):
     leaves = [x + 0.5 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys)]
     params = jax.tree.unflatten(structure, leaves)
     background = None if unbounded else np.float32([1.0, 0.6, 0.2])
-    return field, sampler, params, sampler.init_state(), background
+    model = RayField(field, sampler, background=background, box=None, capacity=CAPACITY)
+    return model, ModelState(params, sampler.init_state())
 
 
 every_setting = pytest.mark.parametrize("codes", [0, 3])
@@ -65,48 +68,48 @@ close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
 @every_space
 @every_setting
 def test_the_jacobians_differentiate_what_is_rendered(unbounded, codes):
-    field, sampler, params, state, background = setting(unbounded, codes)
+    model, state = setting(unbounded, codes)
     rays = rays_through(jax.random.key(3), NUM_RAYS)
     view_ids = jnp.arange(NUM_RAYS) % NUM_VIEWS
-    field_fn = partial(field.apply, params["field"])
+    field_fn = partial(model.field.apply, state.params["field"])
 
     @jax.jit
     def everything():
-        samples, _ = sampler.sample(None, params["sampler"], state, rays)
-        inputs = field.inputs(rays, samples, view_ids)
-        options = {"background": background, "inputs": inputs}
+        samples, _ = model.sampler.sample(None, state.params["sampler"], state.carried, rays)
+        inputs = model.field.inputs(rays, samples, view_ids)
+        options = {"background": model.background, "inputs": inputs}
         rendering = render_rays(rays, samples, field_fn, capacity=CAPACITY, exact=True, **options)
         colours = [
             jacobian_fn(field_fn, rays, samples, **options)[1]
-            for jacobian_fn in (colour_jacobian, split_colour_jacobian)
+            for jacobian_fn in (defined_jacobian, split_jacobian)
         ]
         slopes = field_slopes(field_fn, rays, samples, inputs=inputs)
-        return rendering.rgb, rendering.depth, colours, depth_jacobian(slopes, samples)[1]
+        _, depth, opacity = depth_jacobian(slopes, samples)
+        terms = model.ray_terms(state, rays, most_points=model.most_points, view_ids=view_ids)
+        return rendering, colours, (depth, opacity), terms
 
-    rgb, depth, colours, its_depth = everything()
-    assert np.std(rgb) > 0.01 and np.std(depth) > 0.01
-    for colour in colours:
-        close(colour, rgb)
-    close(its_depth, depth)
+    rendering, colours, (depth, opacity), terms = everything()
+    assert np.std(rendering.rgb) > 0.01 and np.std(rendering.depth) > 0.01
+    for colour in (*colours, terms.rgb):
+        close(colour, rendering.rgb)
+    for found in (depth, terms.depth):
+        close(found, rendering.depth)
+    for found in (opacity, terms.opacity):
+        close(found, rendering.opacity)
+    np.testing.assert_array_equal(terms.thinned, rendering.thinned)
 
 
 @every_space
 @every_setting
 def test_the_predictive_images_are_those_of_the_renderer(unbounded, codes):
-    field, sampler, params, state, background = setting(unbounded, codes)
+    model, state = setting(unbounded, codes)
     grid = DeformationGrid(jnp.asarray(BOX), 2, contracted=unbounded)
     some = rays_through(jax.random.key(3), NUM_RAYS)
     away = some.replace(directions=-some.directions)  # in a bounded scene they meet nothing
     rays = jax.tree.map(lambda *x: jnp.concatenate(x), some, away)
-    predictive = make_predictive_fn(field, sampler, grid, background=background, chunk_samples=128)
-    images = predictive(params, state, jnp.full((grid.num_vertices, 3), 1e-4), rays)
-    want = jax.jit(
-        lambda: basic_images(
-            *render_pixels(
-                field, sampler, params, state, rays, background=background, capacity=CAPACITY
-            )
-        )
-    )()
+    predictive = make_predictive_fn(model, grid, chunk_samples=128)
+    images = predictive(state, jnp.full((grid.num_vertices, 3), 1e-4), rays)
+    want = jax.jit(lambda: basic_images(model.render(state, rays)))()
     assert want.keys() <= images.keys()
     for name, value in want.items():
         close(images[name], value, err_msg=name)
@@ -116,29 +119,28 @@ def test_the_predictive_images_are_those_of_the_renderer(unbounded, codes):
 @every_setting
 def test_the_residual_of_the_curvature_is_that_of_the_render(unbounded, codes):
     """Weighted by its residual, a ray whose true colour is the rendered one has no curvature."""
-    field, sampler, params, state, background = setting(unbounded, codes)
+    model, state = setting(unbounded, codes)
     grid = DeformationGrid(jnp.asarray(BOX), 2, contracted=unbounded)
     rays = rays_through(jax.random.key(3), NUM_RAYS)
     view_ids = jnp.arange(NUM_RAYS) % NUM_VIEWS
 
     @jax.jit
     def rendered():
-        samples, _ = sampler.sample(None, params["sampler"], state, rays)
+        samples, _ = model.sampler.sample(None, state.params["sampler"], state.carried, rays)
         return render_rays(
             rays,
             samples,
-            partial(field.apply, params["field"]),
-            background=background,
+            partial(model.field.apply, state.params["field"]),
+            background=model.background,
             capacity=CAPACITY,
             exact=True,
-            inputs=field.inputs(rays, samples, view_ids),
+            inputs=model.field.inputs(rays, samples, view_ids),
         ).rgb
 
-    curvature = make_curvature_fn(field, sampler, grid, background=background, weighting="eq11")
+    curvature = make_curvature_fn(model, grid, weighting="eq11")
     rgb = np.asarray(rendered())
     right, wrong = (
-        curvature(params, state, rays, targets=targets, view_ids=view_ids)
-        for targets in (rgb, rgb + 0.01)
+        curvature(state, rays, targets=targets, view_ids=view_ids) for targets in (rgb, rgb + 0.01)
     )
     # Squares of residuals of 1e-5 at most, against those of 0.01.
     assert float(wrong.max()) > 0.0 and float(right.max()) < 1e-5 * float(wrong.max())

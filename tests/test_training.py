@@ -10,18 +10,20 @@ import pytest
 
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.fields.hash_grid import make_hash_grid_field, table_roughness
-from bavs_jax.rendering.samplers import make_occupancy_sampler
-from bavs_jax.rendering.sampling import make_march_options
-from bavs_jax.training.batches import (
+from bavs_jax.models.base import ModelState
+from bavs_jax.models.losses import colour_loss
+from bavs_jax.models.objectives import make_colour_objective
+from bavs_jax.models.ray_field import RayField, RayTraining
+from bavs_jax.pixel_table import (
     make_pixel_table,
     pixel_colours,
     sample_pixels,
     training_pixels,
     view_pixel_rays,
 )
+from bavs_jax.rendering.samplers import make_occupancy_sampler
+from bavs_jax.rendering.sampling import make_march_options
 from bavs_jax.training.checkpoints import Checkpoints
-from bavs_jax.training.losses import colour_loss
-from bavs_jax.training.objectives import make_colour_objective
 from bavs_jax.training.train import (
     average_weight,
     init_train_state,
@@ -30,6 +32,7 @@ from bavs_jax.training.train import (
 )
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 from bavs_jax.uncertainty.streaming import make_curvature_fn, table_rays
+from tests.oracles_curvature import colour_terms, split_jacobian
 from tests.toy_scenes import toy_scene
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -37,7 +40,7 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 @pytest.fixture(scope="module")
 def trainer():
-    """A scene with its field, training function and fresh state."""
+    """A scene with a model of it, training function and fresh state."""
     scene = toy_scene()
     field = make_hash_grid_field(
         scene.box,
@@ -53,29 +56,33 @@ def trainer():
     )
     sampler = make_occupancy_sampler(scene.box, options, resolution=16)
     optimiser, schedule = make_optimiser(learning_rate=1e-2, final_share=0.3, num_steps=64)
-    train = make_train_fn(
-        field,
-        sampler,
-        make_colour_objective(field, capacity=1024),
-        optimiser,
-        schedule,
-        num_rays=64,
-        background=scene.background,
-        steps_per_call=4,
-    )
+    model = make_model(scene, field, sampler)
+    train = make_train_fn(model, optimiser, schedule, steps_per_call=4)
 
     def fresh(seed=0):
-        return init_train_state(jax.random.key(seed), field, sampler, optimiser)
+        return init_train_state(jax.random.key(seed), model, optimiser)
 
-    return scene, field, sampler, train, fresh
+    return scene, model, train, fresh
 
 
-def make_train(trainer, optimiser, schedule, *, capacity=1024, **options):
-    """The trainer's training function with other options."""
-    scene, field, sampler, *_ = trainer
+def make_model(scene, field, sampler, *, capacity=1024, **options):
+    """A field with how it is trained; the options are those of `RayTraining`."""
     objective = make_colour_objective(field, capacity=capacity)
-    options = {"num_rays": 64, "background": scene.background, "steps_per_call": 1, **options}
-    return make_train_fn(field, sampler, objective, optimiser, schedule, **options)
+    return RayField(
+        field,
+        sampler,
+        background=scene.background,
+        box=scene.box,
+        capacity=1024,
+        training=RayTraining(objective, num_rays=64, **options),
+    )
+
+
+def make_train(trainer, optimiser, schedule, **options):
+    """One step of the trainer's model, with other options of `make_model`."""
+    scene, model, *_ = trainer
+    model = make_model(scene, model.field, model.sampler, **options)
+    return make_train_fn(model, optimiser, schedule, steps_per_call=1)
 
 
 def test_learning_rate_rises_and_decays():
@@ -126,22 +133,12 @@ def test_the_mean_of_parameters_has_its_age_at_every_step(age):
 
 
 def test_training_renders_the_mean_and_goes_on_from_the_last_parameters(trainer):
-    scene, field, sampler, _, fresh = trainer
+    scene, model, _, fresh = trainer
     optimiser, schedule = make_optimiser(learning_rate=1e-2, final_share=0.3, num_steps=64)
     mask = jnp.ones(scene.num_views, bool)
     last = {}
     for age in (0.0, 0.2):
-        train = make_train_fn(
-            field,
-            sampler,
-            make_colour_objective(field, capacity=1024),
-            optimiser,
-            schedule,
-            num_rays=64,
-            background=scene.background,
-            average_age=age,
-            steps_per_call=4,
-        )
+        train = make_train_fn(model, optimiser, schedule, average_age=age, steps_per_call=4)
         state, path = fresh(), []
         for call in range(3):
             key = jax.random.fold_in(jax.random.key(0), call)
@@ -152,7 +149,7 @@ def test_training_renders_the_mean_and_goes_on_from_the_last_parameters(trainer)
         weights = np.diff(ends) / ends[-1]
         mean = jax.tree.map(lambda *x, w=weights: np.tensordot(w, np.stack(x), 1), *path)
         close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6)
-        jax.tree.map(close, state.params, mean)
+        jax.tree.map(close, state.model.params, mean)
     jax.tree.map(np.testing.assert_array_equal, last[0.0], last[0.2])
 
 
@@ -267,7 +264,7 @@ def test_loss_counts_only_weighted_rays():
 
 
 def test_training_learns_and_compiles_once_while_views_are_added(trainer):
-    scene, _, _, train, fresh = trainer
+    scene, _, train, fresh = trainer
     table, state = make_pixel_table(scene), fresh()
     losses = []
     for call in range(30):
@@ -282,18 +279,19 @@ def test_training_learns_and_compiles_once_while_views_are_added(trainer):
 
 
 def test_the_penalty_pulls_at_the_field_by_its_weight(trainer):
-    scene, field, sampler, *_ = trainer
+    scene, model, *_ = trainer
     table, mask = make_pixel_table(scene), jnp.ones(scene.num_views, bool)
     tables = {}
     for weight in (0.0, 3.0):
         train = make_train(trainer, optax.sgd(0.5), lambda step: 0.5, penalty_weight=weight)
-        start = init_train_state(jax.random.key(0), field, sampler, optax.sgd(0.5))
-        before = jax.tree.map(lambda x: 1e3 * x, start.params["field"]["encoding"])
-        params = start.params | {"field": start.params["field"] | {"encoding": before}}
+        start = init_train_state(jax.random.key(0), model, optax.sgd(0.5))
+        before = jax.tree.map(lambda x: 1e3 * x, start.last_params["field"]["encoding"])
+        field_params = start.last_params["field"] | {"encoding": before}
+        params = start.last_params | {"field": field_params}
         start = start.replace(last_params=params)
         before = jax.tree.map(np.asarray, before)
         after, _ = train(jax.random.key(1), start, table, mask)
-        tables[weight] = jax.tree.map(np.asarray, after.params["field"]["encoding"])
+        tables[weight] = jax.tree.map(np.asarray, after.model.params["field"]["encoding"])
     for name, entries in before.items():
         # 0.5 times the slope of 3 mean(entries^2)
         expected = -0.5 * 3.0 * 2.0 * entries / entries.size
@@ -302,8 +300,8 @@ def test_the_penalty_pulls_at_the_field_by_its_weight(trainer):
 
 
 def test_roughness_is_the_variation_of_dense_levels_and_counts_by_training_pixels(trainer):
-    scene, field, sampler, *_ = trainer
-    params = field.init(jax.random.key(0))
+    scene, model, *_ = trainer
+    params = model.field.init(jax.random.key(0))
     rng = np.random.default_rng(0)
     tables = {k: rng.normal(size=x.shape) for k, x in params["encoding"].items()}
     expected = 0.0
@@ -314,20 +312,20 @@ def test_roughness_is_the_variation_of_dense_levels_and_counts_by_training_pixel
             near = np.moveaxis(grid, axis, 0)
             expected += np.mean([(near[i + 1] - near[i]) ** 2 for i in range(side - 1)])
     rough = params | {"encoding": jax.tree.map(jnp.asarray, tables)}
-    np.testing.assert_allclose(field.roughness(rough), expected, rtol=1e-5)
+    np.testing.assert_allclose(model.field.roughness(rough), expected, rtol=1e-5)
     hashed = table_roughness({"level_0": jnp.ones((16, 2)).at[0].set(9.0)}, (8,))
     assert float(hashed) == 0.0  # a table without neighbours
 
-    start = init_train_state(jax.random.key(0), field, sampler, optax.sgd(1.0))
+    start = init_train_state(jax.random.key(0), model, optax.sgd(1.0))
     start = start.replace(last_params=start.last_params | {"field": rough})
-    slope = jax.grad(lambda p: field.roughness(p))(rough)["encoding"]
+    slope = jax.grad(lambda p: model.field.roughness(p))(rough)["encoding"]
     table, moved = make_pixel_table(scene), {}
     for weight in (0.0, 500.0):
         for num_views in (2, 5):
             train = make_train(trainer, optax.sgd(1.0), lambda step: 1.0, roughness_weight=weight)
             mask = jnp.arange(scene.num_views) < num_views
             after, _ = train(jax.random.key(1), jax.tree.map(jnp.copy, start), table, mask)
-            moved[weight, num_views] = after.params["field"]["encoding"]
+            moved[weight, num_views] = after.model.params["field"]["encoding"]
     for num_views in (2, 5):
         num_pixels = num_views * np.prod(scene.cameras.sizes[0])
         for name in slope:
@@ -338,10 +336,10 @@ def test_roughness_is_the_variation_of_dense_levels_and_counts_by_training_pixel
 
 @pytest.mark.parametrize("capacity, num_rays", [(1, 0), (2048, 64)])
 def test_rays_that_did_not_fit_do_not_count_in_the_loss(trainer, capacity, num_rays):
-    scene, field, sampler, *_ = trainer
+    scene, model, *_ = trainer
     optimiser, schedule = make_optimiser(learning_rate=1e-2, final_share=0.3, num_steps=64)
     train = make_train(trainer, optimiser, schedule, capacity=capacity)
-    start = init_train_state(jax.random.key(0), field, sampler, optimiser)
+    start = init_train_state(jax.random.key(0), model, optimiser)
     mask = jnp.ones(scene.num_views, bool)
     _, info = train(jax.random.key(1), start, make_pixel_table(scene), mask)
     assert info.rays == num_rays and (info.loss > 0.01) == (num_rays > 0)
@@ -349,92 +347,97 @@ def test_rays_that_did_not_fit_do_not_count_in_the_loss(trainer, capacity, num_r
 
 @pytest.mark.parametrize("looked_at, num_rays", [(1, 0), (2048, 64)])
 def test_rays_that_were_not_looked_at_do_not_count_in_the_loss(trainer, looked_at, num_rays):
-    scene, field, sampler, *_ = trainer
+    scene, model, *_ = trainer
     optimiser, schedule = make_optimiser(learning_rate=1e-2, final_share=0.3, num_steps=64)
     train = make_train(
         trainer, optimiser, schedule, capacity=2048, capacity_before_hiding=looked_at
     )
-    start = init_train_state(jax.random.key(0), field, sampler, optimiser)
+    start = init_train_state(jax.random.key(0), model, optimiser)
     mask = jnp.ones(scene.num_views, bool)
     _, info = train(jax.random.key(1), start, make_pixel_table(scene), mask)
     assert info.rays == num_rays and (info.loss > 0.01) == (num_rays > 0)
 
 
 def test_leaving_out_hidden_samples_trains_the_same_with_fewer_of_them(trainer):
-    scene, _, sampler, *_ = trainer
+    scene, model, *_ = trainer
     thick = make_hash_grid_field(
         scene.box, num_levels=1, finest=8, width=16, initial_optical_depth=20.0
     )
     table, mask = make_pixel_table(scene), jnp.ones(scene.num_views, bool)
-    start = init_train_state(jax.random.key(0), thick, sampler, optax.sgd(1.0))
+    thick_model = make_model(scene, thick, model.sampler)
+    start = init_train_state(jax.random.key(0), thick_model, optax.sgd(1.0))
     found = {}
     for looked_at in (0, 2048):
         train = make_train(
-            (scene, thick, sampler),
+            (scene, thick_model),
             optax.sgd(1.0),
             lambda step: 1.0,
             capacity=2048,
             capacity_before_hiding=looked_at,
         )
         state, info = train(jax.random.key(1), jax.tree.map(jnp.copy, start), table, mask)
-        found[looked_at] = state.params["field"], info
+        found[looked_at] = state.model.params["field"], info
     (params, info), (wanted, whole) = found[2048], found[0]
     assert info.rays == whole.rays == 64 and info.samples < 0.5 * whole.samples
     np.testing.assert_allclose(info.loss, whole.loss, rtol=1e-2)
-    moved, wanted = (jax.tree.map(jnp.subtract, p, start.params["field"]) for p in (params, wanted))
+    moved, wanted = (
+        jax.tree.map(jnp.subtract, p, start.model.params["field"]) for p in (params, wanted)
+    )
     off = optax.global_norm(jax.tree.map(jnp.subtract, moved, wanted))
     assert off < 0.1 * optax.global_norm(wanted)
 
 
 def test_training_is_deterministic(trainer):
-    scene, _, _, train, fresh = trainer
+    scene, _, train, fresh = trainer
     table, mask = make_pixel_table(scene), jnp.arange(scene.num_views) < 4
     results = []
     for _ in range(2):
         state = fresh()
         for call in range(3):
             state, _ = train(jax.random.key(call), state, table, mask)
-        results.append(state.params)
+        results.append(state.model.params)
     jax.tree.map(np.testing.assert_array_equal, *results)
 
 
 @pytest.mark.slow
 def test_streamed_curvature_equals_one_dense_call_for_any_bucket(trainer):
-    scene, field, sampler, _, fresh = trainer
-    table, state = make_pixel_table(scene), fresh()
-    occupancy = state.sampler_state
+    scene, model, _, fresh = trainer
+    table, fresh_state = make_pixel_table(scene), fresh().model
+    occupancy = fresh_state.carried
     occupied = jax.random.uniform(jax.random.key(1), occupancy.occupied.shape) < 0.3
     occupancy = occupancy.replace(occupied=occupied)
     params = jax.tree.map(
-        lambda x: x + 0.3 * jax.random.normal(jax.random.key(2), x.shape), state.params
+        lambda x: x + 0.3 * jax.random.normal(jax.random.key(2), x.shape),
+        fresh_state.params,
     )
+    state = ModelState(params, occupancy)
     grid = DeformationGrid(jnp.asarray(scene.box), 3)
     view_ids, pixel_ids = training_pixels(table, np.arange(scene.num_views) < 2)
     pixels = table_rays(table, view_ids, pixel_ids, "eq13")
-    background = jnp.asarray(scene.background)
     rays = view_pixel_rays(table.cameras, jnp.asarray(view_ids), jnp.asarray(pixel_ids))
 
     @jax.jit
     def dense():
         zero = jnp.zeros((grid.num_vertices, 3))
-        samples = sampler.sample(None, {}, occupancy, rays)[0]
-        field_fn = partial(field.apply, params["field"])
-        return add_jac_sq_sum(zero, field_fn, grid, rays, samples, background=background)
+        samples = model.sampler.sample(None, {}, occupancy, rays)[0]
+        field_fn = partial(model.field.apply, params["field"])
+        terms = colour_terms(
+            split_jacobian, field_fn, rays, samples, background=jnp.asarray(scene.background)
+        )
+        return add_jac_sq_sum(zero, terms, grid)
 
     want = dense()
     assert float(want.max()) > 0
     for buckets, chunk in (((8, 16), 256), ((4,), 999)):
-        curvature = make_curvature_fn(
-            field, sampler, grid, background=background, buckets=buckets, chunk_samples=chunk
-        )
+        curvature = make_curvature_fn(model, grid, buckets=buckets, chunk_samples=chunk)
         done = []
-        got = curvature(params, occupancy, **pixels, progress_fn=done.append)
+        got = curvature(state, **pixels, progress_fn=done.append)
         # Another order of the same float32 sums.
         np.testing.assert_allclose(got[0], want, rtol=1e-4, atol=1e-5 * float(want.max()))
         assert sum(done) == len(view_ids)
 
     # A sum for each group of rays.
-    apart = curvature(params, occupancy, **pixels, group_ids=2 * view_ids, num_groups=3)
+    apart = curvature(state, **pixels, group_ids=2 * view_ids, num_groups=3)
     assert got.shape == (1, *want.shape) and apart.shape == (3, *want.shape)
     assert float(apart[0].max()) > 0 and float(apart[2].max()) > 0 and not apart[1].any()
     np.testing.assert_allclose(apart.sum(0), want, rtol=1e-4, atol=1e-5 * float(want.max()))
@@ -449,5 +452,5 @@ def test_checkpoint_round_trip_keeps_the_newest(trainer, tmp_path):
     checkpoints.save(5, fresh(7), {"number": 7})  # the same number again replaces it
     state, meta = checkpoints.restore(fresh())
     assert meta == {"number": 7} and not (tmp_path / "c" / "1").exists()
-    jax.tree.map(np.testing.assert_array_equal, state.params, fresh(7).params)
+    jax.tree.map(np.testing.assert_array_equal, state, fresh(7))
     checkpoints.close()

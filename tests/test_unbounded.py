@@ -23,8 +23,8 @@ from bavs_jax.rendering.proposals import anneal_exponent, make_proposal_sampler
 from bavs_jax.rendering.render import render_rays
 from bavs_jax.rendering.samplers import dense_samples
 from bavs_jax.rendering.spacing import SPACINGS, Interval, open_intervals
-from bavs_jax.uncertainty.curvature import add_jac_sq_sum, colour_jacobian, split_colour_jacobian
-from tests.oracles_curvature import dense_jacobian
+from bavs_jax.uncertainty.curvature import add_jac_sq_sum
+from tests.oracles_curvature import colour_terms, defined_jacobian, dense_jacobian, split_jacobian
 from tests.oracles_unbounded import (
     contract_loop,
     distortion_loop,
@@ -326,7 +326,7 @@ def test_dense_samples_render_alike_in_any_number_of_groups(capacity):
     assert whole.ray_mask.all()
 
 
-@pytest.mark.parametrize("jacobian_fn", [colour_jacobian, split_colour_jacobian])
+@pytest.mark.parametrize("jacobian_fn", [defined_jacobian, split_jacobian])
 def test_curvature_in_contracted_space_is_the_diagonal_of_the_dense_product(x64, jacobian_fn):
     grid = DeformationGrid(jnp.asarray(BOX, jnp.float64), 2, contracted=True)
     rays = inside_rays(5)
@@ -336,7 +336,9 @@ def test_curvature_in_contracted_space_is_the_diagonal_of_the_dense_product(x64,
     zero = jnp.zeros((grid.num_vertices, 3))
     got = jax.jit(
         lambda: add_jac_sq_sum(
-            zero, smooth_field_fn, grid, rays, samples, background=None, jacobian_fn=jacobian_fn
+            zero,
+            colour_terms(jacobian_fn, smooth_field_fn, rays, samples, background=None),
+            grid,
         )
     )()
     np.testing.assert_allclose(got, want, atol=1e-12 * float(want.max()))

@@ -1,23 +1,21 @@
 """The curvature of whole views: which code a field is read with, and which pixels count."""
 
 import dataclasses
-import io
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bavs_jax import active
 from bavs_jax.cameras import take
-from bavs_jax.sources import WEIGHTING, make_candidate_curvature_fn, training_looks
-from bavs_jax.training.batches import num_training_pixels, training_pixels
+from bavs_jax.pixel_table import num_training_pixels, training_pixels
+from bavs_jax.policy_inputs import WEIGHTING, make_candidate_curvature_fn, training_looks
 from bavs_jax.uncertainty.model import Situation
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
-from experiments.progress import track
 from experiments.suggest.choosing import photo_rays
+from tests.toy_rounds import silent
 from tests.toy_runs import toy_config
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -27,19 +25,20 @@ TAKEN = [1, 4, 7]
 SCALE = 0.5
 
 
-def silent(total, description, unit):
-    return track(total, description, unit, stream=io.StringIO())
-
-
 def make_problem(mask=None):
     config = toy_config(field__appearance_features=3)
     scene = load_config_scene(config, cache_dir=None)
-    return build_problem(config, dataclasses.replace(scene, pixel_mask=mask))
+    return build_problem(config, dataclasses.replace(scene, pixel_mask=mask), track=silent)
 
 
 def with_codes(train, codes):
-    field = train.params["field"] | {"appearance": jnp.asarray(codes, jnp.float32)}
-    return train.replace(params=train.params | {"field": field})
+    params = train.model.params
+    field = params["field"] | {"appearance": jnp.asarray(codes, jnp.float32)}
+    return with_params(train, params | {"field": field})
+
+
+def with_params(train, params):
+    return train.replace(model=train.model.replace(params=params))
 
 
 def situation_of(problem, train):
@@ -54,17 +53,17 @@ def situation_of(problem, train):
 def whole():
     """A problem whose field has random parameters, and the situation with a code for each view."""
     problem = make_problem()
-    train = problem.init_train(KEY)
-    leaves, structure = jax.tree.flatten(train.params)
+    train = problem.trainer.init(KEY)
+    leaves, structure = jax.tree.flatten(train.model.params)
     keys = jax.random.split(KEY, len(leaves))
     leaves = [x + 0.3 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys)]
-    train = train.replace(params=jax.tree.unflatten(structure, leaves))
+    train = with_params(train, jax.tree.unflatten(structure, leaves))
     codes = 3.0 * np.random.default_rng(0).normal(size=(len(problem.table.cameras), 3))
     return problem, situation_of(problem, with_codes(train, codes)), codes
 
 
 def candidate_fn(problem, situation):
-    toolbox = problem.make_toolbox(silent)
+    toolbox = problem.toolbox
     return make_candidate_curvature_fn(toolbox, situation, situation.candidates, SCALE)
 
 
@@ -105,7 +104,7 @@ def total_of(toolbox, looks):
 
 
 def assert_looks_are_the_training_curvature(problem, situation):
-    toolbox = problem.make_toolbox(silent)
+    toolbox = problem.toolbox
     jac_sq_sum = training_curvature(KEY, toolbox, situation, WEIGHTING)
     want = 2.0 / situation.num_rays * np.asarray(jac_sq_sum)
     assert_equal_sums(total_of(toolbox, training_looks(toolbox, situation, 1.0)), want)
@@ -132,17 +131,14 @@ def masked(whole):
     return problem, situation_of(problem, situation.train)
 
 
-def test_masked_pixels_are_not_counted(masked, monkeypatch):
+def test_masked_pixels_are_not_counted(masked):
     problem, situation = masked
     mask, offsets = problem.scene.pixel_mask, problem.scene.offsets
     by_hand = [int(mask[offsets[v] : offsets[v + 1]].sum()) for v in TAKEN]
     for scene in (problem.scene, problem.table):
         np.testing.assert_array_equal(num_training_pixels(scene, TAKEN), by_hand)
     assert sum(by_hand) == len(training_pixels(problem.table, situation.is_training_view)[0])
-    seen = []
-    monkeypatch.setattr(active, "make_active_step", lambda *args, **kw: seen.append(kw["num_rays"]))
-    problem.make_step("bavs", TAKEN, silent, "")
-    assert seen == [sum(by_hand)]
+    assert problem.acquisition("bavs", TAKEN, "").num_rays == sum(by_hand)
     pool = [mask[offsets[v] : offsets[v + 1]].sum() for v in problem.scene.pool]
     assert photo_rays(problem) == sum(pool)
 
@@ -160,7 +156,7 @@ def test_reduced_looks_count_by_the_share_that_is_not_masked(whole, masked):
     for keep in (checks == 0, checks == 1):
         image = np.repeat(np.repeat(keep, 2, axis=0), 2, axis=1)
         views.append(jnp.asarray(np.tile(image.ravel(), len(problem.table.cameras))))
-    toolbox = problem.make_toolbox(silent)
+    toolbox = problem.toolbox
     parts = [
         total_of(
             toolbox,
@@ -174,5 +170,5 @@ def test_reduced_looks_count_by_the_share_that_is_not_masked(whole, masked):
     ]
     assert parts[0].max() > 0.0 and parts[1].max() > 0.0
     assert_equal_sums(sum(parts), total_of(toolbox, training_looks(toolbox, situation, SCALE)))
-    looks = training_looks(problem.make_toolbox(silent), masked[1], SCALE)
+    looks = training_looks(problem.toolbox, masked[1], SCALE)
     assert looks[1].h.sum() < 0.1 * looks[0].h.sum(), "one pixel of that view is left"

@@ -5,6 +5,8 @@ import jax.numpy as jnp
 
 from bavs_jax.cameras import Rays
 from bavs_jax.fields.base import Field
+from bavs_jax.models.base import ModelState
+from bavs_jax.models.ray_field import RayField
 from bavs_jax.rendering.samplers import Sampler, dense_samples
 
 
@@ -30,6 +32,14 @@ def smooth_field() -> Field:
         apply=lambda params, x, d: smooth_field_fn(x, d),
         density=lambda params, x: smooth_field_fn(x, x)[0],
     )
+
+
+NOTHING_LEARNT = ModelState({"field": {}, "sampler": {}}, {})  # of a model without parameters
+
+
+def ray_model(field, sampler, background, *, box=None, capacity=10_000) -> RayField:
+    """A field that is only looked at, through a sampler."""
+    return RayField(field, sampler, background=background, box=box, capacity=capacity)
 
 
 def rays_through(key, num, box_half_side=1.0):

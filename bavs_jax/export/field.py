@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bavs_jax.arrays import Array
 from bavs_jax.cameras import take
 from bavs_jax.export.formats import ExportError, import_extra
 from bavs_jax.metrics.chamfer import surface_error
+from bavs_jax.pixel_table import PixelTable, view_pixel_rays
+from bavs_jax.progress import Progress
+from bavs_jax.rendering.images import RenderChunk
 from bavs_jax.scenes.base import Scene
-from bavs_jax.training.batches import PixelTable, view_pixel_rays
 from bavs_jax.uncertainty.measures import look_at_points
 
 BLOCK = 1 << 20  # points whose positions are in memory at once
@@ -41,21 +44,23 @@ def grid_axes(box, resolution: int) -> list[np.ndarray]:
 
 
 def sample_grid(
-    point_fn: Callable, axes, *, block: int = BLOCK, progress_fn=None
+    point_fn: Callable[[np.ndarray], Mapping[str, Array]],
+    axes: Sequence[np.ndarray],
+    *,
+    block: int = BLOCK,
+    progress_fn: Progress | None = None,
 ) -> dict[str, np.ndarray]:
-    """Reads a field at all points of a grid, a block of points at a time.
+    """Reads a field at all points of a grid, a block at a time: by name, [X, Y, Z] float32.
 
     Args:
-      point_fn: positions [K, 3] -> dict of [K].
+      point_fn: from positions [K, 3], scene units, arrays [K] by name.
       axes: [X], [Y], [Z], scene units.
       block: points of one call.
       progress_fn: called with the number of points done.
-
-    Returns:
-      dict of [X, Y, Z] float32.
     """
     shape = tuple(len(axis) for axis in axes)
-    num, values = int(np.prod(shape)), {}
+    num = int(np.prod(shape))
+    values: dict[str, np.ndarray] = {}
     for start in range(0, num, block):
         stop = min(start + block, num)
         index = np.unravel_index(np.arange(start, stop), shape)
@@ -71,19 +76,19 @@ MIN_OPACITY = 0.5
 
 
 def ray_end_points(
-    render_fn: Callable,
+    render_fn: RenderChunk,
     table: PixelTable,
     view_ids,
     pixel_ids,
     *,
     chunk: int,
     min_opacity: float = MIN_OPACITY,
-    progress_fn=None,
+    progress_fn: Progress | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points at the expected depth of rays through pixels that are not empty: `o + depth d`.
 
     Args:
-      render_fn: `Rays` [chunk] -> dict with "rgb" [chunk, 3], "depth" and "opacity" [chunk].
+      render_fn: renders "rgb" [R, 3], "depth" and "opacity" [R] of R = `chunk` rays.
       table: the scene's pixels.
       view_ids, pixel_ids: [N] views and numbers of the pixels (`batches.training_pixels`).
       chunk: rays of one call.

@@ -60,7 +60,7 @@ def ply_bytes(positions, rgb, properties: dict[str, np.ndarray], faces=None) -> 
 
 
 def nrrd_bytes(values, axes, *, user_from_scene, content: str) -> bytes:
-    """One quantity on a grid, placed in the user's coordinates.
+    """One quantity on a grid, placed in the user's coordinates, as a compressed file.
 
     A similarity may turn the grid: NRRD holds a vector per axis in place of a spacing. Point
     `(i, j, k)` lies at `origin + i step_x + j step_y + k step_z`.
@@ -70,9 +70,6 @@ def nrrd_bytes(values, axes, *, user_from_scene, content: str) -> bytes:
       axes: [X], [Y], [Z] of at least two planes each, scene units.
       user_from_scene: [4, 4] similarity.
       content: what the values are, with their unit.
-
-    Returns:
-      the file, compressed.
 
     Raises:
       ExportError: pynrrd is not installed.

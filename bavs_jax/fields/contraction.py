@@ -14,6 +14,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from bavs_jax.arrays import Array
+
 RADIUS = 2.0  # contracted space is [-2, 2]^3
 FARTHEST = 1e4  # half sides of the box; what stands for infinitely far
 
@@ -26,7 +28,7 @@ def contract(x: jax.Array) -> jax.Array:
     derivative of `max` asks which entry equals the maximum; a compiler that computes the entries
     anew, rounded otherwise, finds none and divides by 0. A comparison has no such gap.
     """
-    norm = 1.0
+    norm: jax.Array | float = 1.0
     for axis in range(3):
         size = jnp.abs(x[..., axis : axis + 1])
         norm = jnp.where(size > norm, size, norm)
@@ -46,7 +48,7 @@ def in_box(unit: jax.Array, *, contracted: bool) -> jax.Array:
     return (jnp.abs(unit - 0.5) <= 0.25).all(-1)
 
 
-def unit_coordinates(box: jax.Array, positions: jax.Array, *, contracted: bool) -> jax.Array:
+def unit_coordinates(box: Array, positions: Array, *, contracted: bool) -> jax.Array:
     """Positions [..., 3] in scene units as coordinates in [0, 1]^3.
 
     Args:
@@ -54,9 +56,6 @@ def unit_coordinates(box: jax.Array, positions: jax.Array, *, contracted: bool) 
       positions: [..., 3] scene units.
       contracted: false spreads the box over the unit cube, and points outside get the nearest
         face; true puts it into [1/4, 3/4]^3 and contracts the rest of space around it.
-
-    Returns:
-      [..., 3] in [0, 1].
     """
     lower, upper = box
     if not contracted:
@@ -65,7 +64,7 @@ def unit_coordinates(box: jax.Array, positions: jax.Array, *, contracted: bool) 
     return contract(centred) / (2.0 * RADIUS) + 0.5
 
 
-def scene_positions(box: jax.Array, unit: jax.Array, *, contracted: bool) -> jax.Array:
+def scene_positions(box: Array, unit: Array, *, contracted: bool) -> jax.Array:
     """The inverse of `unit_coordinates`: [..., 3] in [0, 1] as positions in scene units.
 
     Numerics: the faces of the unit cube, which stand for infinitely far in contracted space, are

@@ -18,8 +18,7 @@ from bavs_jax.fields.contraction import in_box, scene_positions, unit_coordinate
 CORNERS = np.indices((2, 2, 2), np.int32).reshape(3, 8).T
 
 
-@struct.dataclass
-class DeformationGrid:
+class DeformationGrid(struct.PyTreeNode):
     """`(2^L + 1)^3` vertices over the scene box, or over contracted space around it."""
 
     box: jax.Array  # [2, 3] scene units
@@ -135,7 +134,7 @@ def trilinear(grid: DeformationGrid, positions: jax.Array) -> tuple[jax.Array, j
 
 
 def interpolate(grid: DeformationGrid, values: jax.Array, positions: jax.Array, *, power: int = 1):
-    """`sum_k b_k^power values_k` over the eight vertices around each position.
+    """`sum_k b_k^power values_k` over the eight vertices around each position, [...].
 
     One corner after another, which a CPU does several times faster than one [..., 8] gather.
 
@@ -144,15 +143,12 @@ def interpolate(grid: DeformationGrid, values: jax.Array, positions: jax.Array, 
       values: [G] one number per vertex.
       positions: [..., 3] scene units.
       power: of the trilinear weights.
-
-    Returns:
-      [...].
     """
     scaled = grid_coordinates(grid, positions)
     base = jnp.minimum(jnp.floor(scaled), grid.cells - 1)
     frac = scaled - base
     base = base.astype(jnp.int32)
-    total = 0.0
+    total: jax.Array | float = 0.0
     for corner in CORNERS:
         b = jnp.where(corner, frac, 1.0 - frac)
         b = b[..., 0] * b[..., 1] * b[..., 2]
@@ -162,15 +158,12 @@ def interpolate(grid: DeformationGrid, values: jax.Array, positions: jax.Array, 
 
 
 def displace(grid: DeformationGrid, offsets: jax.Array, positions: jax.Array) -> jax.Array:
-    """The offset at each position, `D_theta(x) = sum_k b_k theta_k`, scene units.
+    """The offset at each position, `D_theta(x) = sum_k b_k theta_k`, [..., 3] scene units.
 
     Args:
       grid: the grid.
       offsets: theta [G, 3], scene units.
       positions: [..., 3].
-
-    Returns:
-      [..., 3].
     """
     rows, b = trilinear(grid, positions)
     return (b[..., None] * offsets[rows]).sum(-2)

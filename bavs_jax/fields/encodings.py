@@ -23,15 +23,12 @@ def level_resolutions(num_levels: int, coarsest: int, finest: int) -> tuple[int,
 
 
 def _corner_rows(base, *, resolution: int, table_size: int) -> list[jax.Array]:
-    """Rows of the eight corners of cells, z fastest: dense numbering where it fits, else hashed.
+    """Rows [K] uint32 of each of eight corners, z fastest: numbered where that fits, else hashed.
 
     Args:
       base: [3, K] lowest corner of each cell, whole numbers.
       resolution: cells per side.
       table_size: rows of the table.
-
-    Returns:
-      Eight arrays [K] of uint32.
     """
     x, y, z = base.astype(jnp.uint32)
     corners = [(dx, dy, dz) for dx in (0, 1) for dy in (0, 1) for dz in (0, 1)]

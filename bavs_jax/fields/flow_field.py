@@ -6,15 +6,15 @@ flows carry it to a density and a colour, and what is known about the point stee
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bavs_jax.fields.base import Field, Params
+from bavs_jax.arrays import Array
+from bavs_jax.fields.base import Field, FieldDensity, InitParams, Params, ParamsTerm
 from bavs_jax.fields.contraction import unit_coordinates
 from bavs_jax.fields.encodings import HashEncoding, level_resolutions, spherical_harmonics
 from bavs_jax.fields.flows import apply_flows, flow_from_raw, num_flow_parameters
@@ -25,24 +25,26 @@ from bavs_jax.fields.positional import positional_encoding
 NOISE_DIM = 4  # one number for the density, three for the colour
 
 
+class ApplyFlow(Protocol):
+    """Density [N], rgb [N, 3] and {"log_prob": [N]} of the field that `noise` [4] draws, at
+    positions [N, 3] along directions [N, 3]: `log q(density, rgb | x, d)`, nats."""
+
+    def __call__(
+        self, params: Params, positions: Array, directions: Array, noise: Array
+    ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]: ...
+
+
 class FlowField(NamedTuple):
     """A distribution over radiance fields as pure functions of parameters, N points and one draw.
-
-    `init(key) -> params`
-    `apply(params, positions [N, 3], directions [N, 3], noise [4]) ->
-      (density [N], rgb [N, 3], {"log_prob": [N]})`, the field of one draw and, at each point,
-      `log q(density, rgb | x, d)`, nats
-    `density(params, positions [N, 3]) -> density [N]`, that of the base's mean, for samplers
-    `penalty(params) -> []`, what training adds to the loss, times a weight
 
     `noise` is standard normal, see `base_draws`; at 0 it is the base's mean. `jax.vmap` over
     `noise` alone reads the network once for all draws. Units are those of `Field`.
     """
 
-    init: Callable[..., Params]
-    apply: Callable[..., tuple]
-    density: Callable[..., Any]
-    penalty: Callable[[Params], Any] = lambda params: 0.0
+    init: InitParams
+    apply: ApplyFlow
+    density: FieldDensity  # of the base's mean, for samplers
+    penalty: ParamsTerm = lambda params: 0.0  # what training adds to the loss, times a weight
 
 
 def base_draws(key, num_draws: int, *, with_mean: bool = False) -> jax.Array:
@@ -238,9 +240,6 @@ def make_flow_field(
         common one, and many colours away from black and white.
       density_scale: see `positive_density`; by default 128 per longest side of the box.
       contracted: see `unit_coordinates`.
-
-    Returns:
-      A `FlowField`.
     """
     box = np.asarray(box, np.float32)
     trunk = HashTrunk(
@@ -284,9 +283,6 @@ def make_flow_mlp_field(
       depth, width, skip, position_degree, direction_degree: as in `make_nerf_mlp_field`.
       condition_features, num_flows, amplitude, density_scale: as in `make_flow_field`.
       contracted: see `unit_coordinates`.
-
-    Returns:
-      A `FlowField`.
     """
     box = np.asarray(box, np.float32)
     encode, _ = make_position_encoding(

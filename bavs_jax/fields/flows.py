@@ -6,7 +6,9 @@ runs along the points, not along the few components of each.
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from typing import NamedTuple
 
 import jax
@@ -86,7 +88,8 @@ def _upper_product(matrix: list[list[jax.Array]], z: list[jax.Array]) -> list[ja
     components, be it of three, runs fifty times slower.
     """
     dim = len(z)
-    return [sum(matrix[i][j] * z[j] for j in range(i, dim)) for i in range(dim)]
+    rows = ((matrix[i][j] * z[j] for j in range(i, dim)) for i in range(dim))
+    return [functools.reduce(operator.add, row) for row in rows]
 
 
 def apply_flow(flow: SylvesterFlow, z: jax.Array, *, reverse: bool) -> tuple[jax.Array, jax.Array]:
@@ -105,12 +108,13 @@ def apply_flow(flow: SylvesterFlow, z: jax.Array, *, reverse: bool) -> tuple[jax
     """
     r1, r2 = ([_unstack(row) for row in _unstack(matrix)] for matrix in (flow.r1, flow.r2))
     order = range(len(z))[:: -1 if reverse else 1]
-    z = _unstack(z)
-    inner = _upper_product(r2, [z[i] for i in order])
+    parts = _unstack(z)
+    inner = _upper_product(r2, [parts[i] for i in order])
     hidden = [jnp.tanh(x + shift) for x, shift in zip(inner, _unstack(flow.b))]
     moved = _upper_product(r1, hidden)
     slopes = [1.0 + r1[i][i] * r2[i][i] * (1.0 - jnp.square(x)) for i, x in enumerate(hidden)]
-    return jnp.stack([z[i] + moved[order[i]] for i in range(len(z))]), jnp.log(math.prod(slopes))
+    after = jnp.stack([part + moved[order[i]] for i, part in enumerate(parts)])
+    return after, jnp.log(math.prod(slopes))
 
 
 def apply_flows(flows: SylvesterFlow, z: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -123,8 +127,8 @@ def apply_flows(flows: SylvesterFlow, z: jax.Array) -> tuple[jax.Array, jax.Arra
     Returns:
       `z'` [D, ...] and `log |det dz'/dz|` [...], summed over the flows.
     """
-    log_det = 0.0
+    log_dets = []
     for number, flow in enumerate(zip(*map(_unstack, flows))):
         z, change = apply_flow(SylvesterFlow(*flow), z, reverse=number % 2 == 1)
-        log_det += change
-    return z, log_det
+        log_dets.append(change)
+    return z, functools.reduce(operator.add, log_dets)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 
 import flax.linen as nn
 import jax
@@ -116,9 +118,6 @@ def make_hash_grid_field(
         a point's colour (ActiveNeRF); trained by `make_variance_objective`.
       initial_optical_depth: density times the box's side before training. A thick fog would hide
         from each ray what lies behind, and fill every sample there is room for.
-
-    Returns:
-      A `Field`.
     """
     box = jnp.asarray(box, jnp.float32)
     module = HashGridField(
@@ -176,7 +175,7 @@ def table_penalty(tables: dict) -> jax.Array:
     A mean per level, so that the few entries of a coarse level weigh as much as the many of a
     fine one (Barron et al. 2023, section 5).
     """
-    return sum(jnp.square(table).mean() for table in tables.values())
+    return functools.reduce(operator.add, (jnp.square(x).mean() for x in tables.values()))
 
 
 def table_roughness(tables: dict, resolutions: tuple[int, ...]) -> jax.Array:

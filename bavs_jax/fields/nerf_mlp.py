@@ -12,7 +12,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from bavs_jax.fields.base import DensityField, Field, no_inputs
+from bavs_jax.fields.base import DensityField, Field, InputsFn, no_inputs
 from bavs_jax.fields.contraction import unit_coordinates
 from bavs_jax.fields.positional import cone_variance, integrated_encoding, positional_encoding
 from bavs_jax.numerics import point_variance
@@ -92,7 +92,7 @@ class MlpDensity(nn.Module):
 
 def make_position_encoding(
     box, *, degree: int, contracted: bool, pixel_radius: float | None
-) -> tuple[Callable, Callable]:
+) -> tuple[Callable[..., jax.Array], InputsFn]:
     """How a network reads positions, and what it needs to know of each sample for that.
 
     Args:
@@ -102,7 +102,8 @@ def make_position_encoding(
       pixel_radius: radius of a pixel's cone at distance 1; None reads points.
 
     Returns:
-      `encode(positions [K, 3], variance [K, 3] or None)` and the field's `inputs`.
+      The encoding `encode(positions [K, 3], variance=None) -> [K, E]`, of cones that are about
+      there where a variance [K, 3] along each axis is given; and the field's `inputs`.
 
     Raises:
       ValueError: a cone in contracted space, whose shape is not followed through the contraction.
@@ -146,9 +147,6 @@ def make_nerf_mlp_field(
       contracted: see `unit_coordinates`.
       pixel_radius: of a pixel's cone at distance 1, for the integrated encoding; None for points.
       learned_variance: see `make_hash_grid_field`.
-
-    Returns:
-      A `Field`.
     """
     encode, inputs = make_position_encoding(
         box, degree=position_degree, contracted=contracted, pixel_radius=pixel_radius

@@ -30,9 +30,6 @@ def integrated_encoding(mean: jax.Array, variance: jax.Array, degree: int) -> ja
       mean: [..., 3].
       variance: [..., 3] >= 0.
       degree: octaves.
-
-    Returns:
-      [..., 6 * degree].
     """
     phase = _phases(mean, degree)
     scale = jnp.square(jnp.pi * 2.0 ** jnp.arange(degree, dtype=mean.dtype))

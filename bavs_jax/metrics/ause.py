@@ -15,6 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bavs_jax.registry import check_known
+
 NUM_FRACTIONS = 100
 ERRORS = ("mae", "mse", "rmse")
 
@@ -53,8 +55,7 @@ def sparsification_curve(errors, order_by, fractions, *, error: str = "mae") -> 
       ValueError: no pixels, shapes differ, values are not finite, or an unknown error.
     """
     errors, order_by = np.asarray(errors, np.float64), np.asarray(order_by, np.float64)
-    if error not in ERRORS:
-        raise ValueError(f"error: {error!r} is unknown; use one of {', '.join(ERRORS)}")
+    check_known("error", error, ERRORS)
     if errors.ndim != 1 or errors.shape != order_by.shape or len(errors) == 0:
         raise ValueError(f"errors {errors.shape} and order {order_by.shape}: give one [N], N > 0")
     if not (np.isfinite(errors).all() and np.isfinite(order_by).all()):

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+import operator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from bavs_jax.arrays import Array
+from bavs_jax.metrics.perceptual import LpipsFn, check_images
 
 SSIM_TAPS = 11  # pixels, the window of Wang et al. 2004
 SSIM_SIGMA = 1.5  # pixels
 SSIM_K1, SSIM_K2 = 0.01, 0.03
 
 
-def quantise_uint8(image: jax.Array) -> jax.Array:
+def quantise_uint8(image: Array) -> jax.Array:
     """What is left of an image once it is saved with 8 bits: `round(255 clip(image, 0, 1)) / 255`.
 
     Published numbers are measured on saved files (nerfbaselines' protocol), hence also these.
@@ -27,7 +31,7 @@ def quantise_uint8(image: jax.Array) -> jax.Array:
     return jnp.round(255.0 * jnp.clip(image, 0.0, 1.0)) / 255.0
 
 
-def psnr(prediction: jax.Array, truth: jax.Array, mask: jax.Array | None = None) -> jax.Array:
+def psnr(prediction: Array, truth: Array, mask: Array | None = None) -> jax.Array:
     """Peak signal-to-noise ratio for a data range of 1: `-10 log10(mean (prediction - truth)^2)`.
 
     Args:
@@ -41,7 +45,7 @@ def psnr(prediction: jax.Array, truth: jax.Array, mask: jax.Array | None = None)
     Raises:
       ValueError: the shapes differ or are not those of images.
     """
-    _check_images(prediction, truth)
+    check_images(prediction, truth)
     where = None if mask is None else mask[..., None]
     mse = jnp.mean(jnp.square(prediction - truth), axis=(-3, -2, -1), where=where)
     return -10.0 * jnp.log10(mse)
@@ -67,7 +71,7 @@ def ssim(prediction: jax.Array, truth: jax.Array) -> jax.Array:
     *Numerics*: (co)variances do not change when a constant is taken off, and `E[x^2] - E[x]^2`
     cancels least near 0, so they are computed about mid-grey.
     """
-    _check_images(prediction, truth)
+    check_images(prediction, truth)
     if min(truth.shape[-3:-1]) < SSIM_TAPS:
         raise ValueError(
             f"image: {truth.shape[-2]} x {truth.shape[-3]} pixels are fewer than SSIM's window of "
@@ -86,11 +90,11 @@ def ssim(prediction: jax.Array, truth: jax.Array) -> jax.Array:
 
 
 def measure_images(
-    prediction: jax.Array,
-    truth: jax.Array,
+    prediction: Array,
+    truth: Array,
     *,
-    mask: jax.Array | None = None,
-    lpips_fn: Callable | None = None,
+    mask: Array | None = None,
+    lpips_fn: LpipsFn | None = None,
 ) -> dict[str, jax.Array | None]:
     """All image measures by the 8-bit protocol: both images are quantised, then compared.
 
@@ -117,14 +121,6 @@ def measure_images(
     }
 
 
-def _check_images(prediction: jax.Array, truth: jax.Array) -> None:
-    if prediction.shape != truth.shape or truth.ndim < 3 or truth.shape[-1] != 3:
-        raise ValueError(
-            f"image: prediction {prediction.shape} and truth {truth.shape} must both be "
-            "[..., H, W, 3]"
-        )
-
-
 def _window_mean(image: jax.Array) -> jax.Array:
     """Gaussian-weighted mean over each whole window, [..., H - 10, W - 10, 3]."""
     offsets = np.arange(SSIM_TAPS) - SSIM_TAPS // 2
@@ -133,10 +129,11 @@ def _window_mean(image: jax.Array) -> jax.Array:
     # Two passes of shifted sums: a convolution would lose digits to TF32 on some accelerators.
     for axis in (-3, -2):
         length = image.shape[axis] - SSIM_TAPS + 1
-        image = sum(
+        shifted = (
             float(weight) * jax.lax.slice_in_dim(image, i, i + length, axis=axis)
             for i, weight in enumerate(weights)
         )
+        image = functools.reduce(operator.add, shifted)
     return image
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
+
+from bavs_jax.arrays import DensityFn
 
 NUM_DIRECTIONS = 128
 SHELLS = (0.25, 0.5, 0.75, 1.05)  # of the clearance
@@ -39,14 +40,13 @@ def ball_offsets() -> np.ndarray:
 
 
 def judge_positions(
-    positions, density_fn: Callable, *, clearance: float, solid_density: float, chunk: int = 65536
+    positions, density_fn: DensityFn, *, clearance: float, solid_density: float, chunk: int = 65536
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which places lie inside of matter, and which others have matter within the clearance.
 
     Args:
       positions: [N, 3] scene units.
-      density_fn: points [chunk, 3] -> density [chunk], 1 / scene unit, of any field; 0 where
-        there is nothing.
+      density_fn: of any field.
       clearance: radius that must be free, scene units.
       solid_density: density from which on there is matter, 1 / scene unit; see `matter_density`.
       chunk: points of one call of `density_fn`, the last ones filled up.
@@ -79,16 +79,13 @@ def within_bounds(positions, bounds) -> np.ndarray:
     return ((positions >= lower) & (positions <= upper)).all(axis=-1)
 
 
-def optical_depth(density_fn: Callable, starts, ends, *, num_samples: int = 64) -> np.ndarray:
-    """Light lost between pairs of points, `integral density dt`, by the midpoint rule.
+def optical_depth(density_fn: DensityFn, starts, ends, *, num_samples: int = 64) -> np.ndarray:
+    """Light lost between pairs of points, `integral density dt`, by the midpoint rule, [N] nats.
 
     Args:
-      density_fn: points [K, 3] -> density [K], 1 / scene unit.
+      density_fn: of any field.
       starts, ends: [N, 3] scene units.
       num_samples: of each way.
-
-    Returns:
-      [N] >= 0, nats.
     """
     starts, ends = np.asarray(starts, np.float32), np.asarray(ends, np.float32)
     share = (np.arange(num_samples, dtype=np.float32) + 0.5) / num_samples

@@ -30,13 +30,17 @@ class Proposals:
 
 
 def collect_poses(
-    draw_fn: Callable, judge_fn: Callable, num: int, *, max_laps: int = 16
+    draw_fn: Callable[[int], np.ndarray],
+    judge_fn: Callable[[np.ndarray], np.ndarray],
+    num: int,
+    *,
+    max_laps: int = 16,
 ) -> Proposals:
     """Draws until `num` poses are allowed, or `max_laps` times.
 
     Args:
-      draw_fn: lap number -> poses [n, 3, 4]; none at all ends the laps.
-      judge_fn: poses [n, 3, 4] -> reason of each, [n] int: an index of `REASONS`, or -1: allowed.
+      draw_fn: from the number of a lap to poses [n, 3, 4]; none at all ends the laps.
+      judge_fn: poses [n, 3, 4] -> reasons [n] int, an index of `REASONS` or -1: allowed.
       num: how many are wanted.
       max_laps: how often to draw at most.
 
@@ -44,7 +48,9 @@ def collect_poses(
       At most `num` allowed poses, in the order of drawing. Draws after the last of them count as
       not drawn.
     """
-    kept, reasons, num_kept = [np.zeros((0, 3, 4))], [np.zeros(0, int)], 0
+    kept: list[np.ndarray] = [np.zeros((0, 3, 4))]
+    reasons: list[np.ndarray] = [np.zeros(0, int)]
+    num_kept = 0
     for lap in range(max_laps):
         poses = draw_fn(lap)
         if not len(poses):
@@ -57,9 +63,9 @@ def collect_poses(
         num_kept += len(kept[-1])
         if num_kept >= num:
             break
-    reasons = np.concatenate(reasons)
-    counts = {name: int((reasons == i).sum()) for i, name in enumerate(REASONS)}
-    return Proposals(np.concatenate(kept), len(reasons), counts)
+    every = np.concatenate(reasons)
+    counts = {name: int((every == i).sum()) for i, name in enumerate(REASONS)}
+    return Proposals(np.concatenate(kept), len(every), counts)
 
 
 def check_enough(proposals: Proposals, num_needed: int, *, fixes: dict[str, str]) -> None:
@@ -72,7 +78,7 @@ def check_enough(proposals: Proposals, num_needed: int, *, fixes: dict[str, str]
     """
     if len(proposals.poses) >= num_needed:
         return
-    main = max(proposals.dropped, key=proposals.dropped.get)
+    main = max(proposals.dropped, key=proposals.dropped.__getitem__)
     fix = fixes[main if proposals.dropped[main] else ""]
     raise PlacementError(
         f"candidates: {num_needed} places for a camera are needed, but of "

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
+from bavs_jax.arrays import DensityFn
 from bavs_jax.cameras import Cameras
 from bavs_jax.placement.clearance import optical_depth
 
@@ -13,16 +12,13 @@ PULL = 1e-6  # of the fallback against one camera; decides only where the axes d
 
 
 def focus_point(world_from_cam, fallback) -> np.ndarray:
-    """The point closest to all optical axes, in the sense of least squares.
+    """The point [3] closest to all optical axes, in the sense of least squares.
 
     Solves `sum_v (I - d_v d_v^T) (x - p_v) = 0` for camera centres `p` and view directions `d`.
 
     Args:
       world_from_cam: [V, 3 or 4, 4] poses, OpenGL axes.
       fallback: [3] which point of a common line to take where all axes are parallel.
-
-    Returns:
-      [3] float64, in the unit of the poses.
 
     Numerics: a weak pull towards `fallback` keeps the system regular.
     """
@@ -42,13 +38,13 @@ def share_facing(world_from_cam, point) -> float:
     return float(((towards * -poses[:, :3, 2]).sum(axis=-1) > 0.0).mean())
 
 
-def count_seeing(cameras: Cameras, position, density_fn: Callable) -> int:
+def count_seeing(cameras: Cameras, position, density_fn: DensityFn) -> int:
     """How many cameras have a place in their image, with at least half of its light unhidden.
 
     Args:
       cameras: [V].
       position: [3] scene units.
-      density_fn: points [K, 3] -> density [K], 1 / scene unit.
+      density_fn: of any field.
 
     Numerics: lens distortion is left out, which moves the image's edge by a few pixels.
     """
@@ -67,7 +63,9 @@ def count_seeing(cameras: Cameras, position, density_fn: Callable) -> int:
     return int((in_image & (optical_depth(density_fn, poses[:, :, 3], ends) < np.log(2.0))).sum())
 
 
-def in_unknown_space(positions, cameras: Cameras, density_fn: Callable, *, reach: float):
+def in_unknown_space(
+    positions, cameras: Cameras, density_fn: DensityFn, *, reach: float
+) -> np.ndarray:
     """Which places no camera sees and none stands near, [N] bool.
 
     A field says nothing about space that no photo looks into: it is free there because nothing

@@ -6,8 +6,6 @@ rendering; the fine field is read at these samples and at more drawn from the co
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 
@@ -16,13 +14,14 @@ from bavs_jax.rendering.compositing import composite_colour, render_weights
 from bavs_jax.rendering.histograms import even_places, sample_histogram
 from bavs_jax.rendering.samplers import Sampler, dense_samples
 from bavs_jax.rendering.sampling import flatten_inputs, sample_positions
+from bavs_jax.rendering.spacing import IntervalFn
 
 PADDING = 1e-5  # weight that each coarse interval gets on top, as in NeRF
 
 
 def make_coarse_to_fine_sampler(
     coarse: Field,
-    interval_fn: Callable,
+    interval_fn: IntervalFn,
     *,
     background,
     num_coarse: int = 64,
@@ -32,7 +31,7 @@ def make_coarse_to_fine_sampler(
 
     Args:
       coarse: a radiance field of its own.
-      interval_fn: `Rays` [R] -> `Interval`.
+      interval_fn: near and far of each ray, and the spacing between.
       background: [3] colour behind everything, or None (see `composite_colour`).
       num_coarse, num_fine: samples of each kind; the fine field is read at both together.
     """

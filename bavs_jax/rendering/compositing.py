@@ -52,10 +52,7 @@ def composite(weights: jax.Array, values: jax.Array, background) -> jax.Array:
     Args:
       weights: [..., S].
       values: [..., S, C].
-      background: broadcastable to [..., C].
-
-    Returns:
-      [..., C].
+      background: broadcastable to the result [..., C].
     """
     opacity = weights.sum(-1)
     return (weights[..., None] * values).sum(-2) + (1.0 - opacity)[..., None] * background

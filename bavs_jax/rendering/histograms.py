@@ -53,14 +53,11 @@ def sample_histogram(edges: jax.Array, weights: jax.Array, places: jax.Array) ->
 
 
 def overlapping_weight(edges: jax.Array, weights: jax.Array, lower, upper) -> jax.Array:
-    """Weight of all intervals that overlap [lower, upper] (Mip-NeRF 360, Eq 12).
+    """Weight of all intervals that overlap [lower, upper] (Mip-NeRF 360, Eq 12), [..., M].
 
     Args:
       edges, weights: the histogram, [..., N + 1] and [..., N].
       lower, upper: [..., M].
-
-    Returns:
-      [..., M].
     """
     starts, ends = edges[..., None, :-1], edges[..., None, 1:]
     overlaps = (starts < upper[..., None]) & (ends > lower[..., None])

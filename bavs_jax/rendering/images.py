@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
+from typing import Protocol
 
 import jax
 import numpy as np
 
-from bavs_jax.cameras import Cameras, image_pixels, pixel_rays, take
+from bavs_jax.arrays import Array
+from bavs_jax.cameras import Cameras, Rays, image_pixels, pixel_rays, take
+from bavs_jax.progress import Progress, map_chunks
+
+
+class RenderChunk(Protocol):
+    """What R rays see, by name: arrays [R, ...]. R is the same at every call: it compiles once."""
+
+    def __call__(self, rays: Rays, /) -> Mapping[str, Array]: ...
 
 
 def render_pixels(
-    chunk_fn: Callable,
+    chunk_fn: RenderChunk,
     cameras: Cameras,
     view_ids: np.ndarray,
     pixels: np.ndarray,
     *,
     chunk: int,
-    progress_fn: Callable[[int], None] | None = None,
+    progress_fn: Progress | None = None,
 ) -> dict[str, np.ndarray]:
-    """Streams N pixels through a compiled function of `chunk` rays.
+    """Streams N pixels through a compiled function of `chunk` rays, to host arrays [N, ...].
 
     Args:
       chunk_fn: `Rays` [chunk] -> dict of arrays [chunk, ...].
@@ -28,29 +37,26 @@ def render_pixels(
       pixels: [N, 2] pixel coordinates.
       chunk: rays of one call; the last call is padded with copies of the last ray.
       progress_fn: called with the number of rays done since the last call.
-
-    Returns:
-      dict of host arrays [N, ...].
     """
-    num = len(view_ids)
     cameras = jax.tree.map(np.asarray, cameras)
-    parts = []
-    for start in range(0, num, chunk):
-        rows = np.minimum(np.arange(start, start + chunk), num - 1)
+
+    def render(rows):
         # A camera for each ray: compiled once, however many cameras there are.
-        rays = _pixel_rays(take(cameras, view_ids[rows]), np.arange(chunk), pixels[rows])
-        count = min(chunk, num - start)
-        parts.append(jax.tree.map(lambda x, n=count: np.asarray(x)[:n], chunk_fn(rays)))
-        if progress_fn is not None:
-            progress_fn(count)
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return chunk_fn(_pixel_rays(take(cameras, view_ids[rows]), np.arange(chunk), pixels[rows]))
+
+    return map_chunks(render, len(view_ids), chunk, progress_fn)
 
 
 _pixel_rays = jax.jit(pixel_rays)
 
 
 def render_views(
-    chunk_fn: Callable, cameras: Cameras, view_ids, *, chunk: int, progress_fn=None
+    chunk_fn: RenderChunk,
+    cameras: Cameras,
+    view_ids,
+    *,
+    chunk: int,
+    progress_fn: Progress | None = None,
 ) -> list[dict[str, np.ndarray]]:
     """Renders whole views; each as a dict of images [H, W, ...]. Arguments as `render_pixels`."""
     sizes = np.asarray(cameras.sizes)[view_ids]

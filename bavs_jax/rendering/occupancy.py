@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from bavs_jax.arrays import DensityFn
+
 WARMUP_UPDATES = 2
 
 
-@struct.dataclass
-class Occupancy:
+class Occupancy(struct.PyTreeNode):
     """A cubic grid over the scene box; rays only spend samples in occupied cells."""
 
     density: jax.Array  # [G^3] float32, decaying maximum of sampled density, 1 / scene unit
@@ -56,7 +55,7 @@ def cell_centres(occupancy: Occupancy, index: jax.Array) -> jax.Array:
 def update_occupancy(
     key: jax.Array,
     occupancy: Occupancy,
-    density_fn: Callable,
+    density_fn: DensityFn,
     *,
     num_samples: int,
     step_size: float,
@@ -72,7 +71,7 @@ def update_occupancy(
     Args:
       key: random key.
       occupancy: the grid.
-      density_fn: [K, 3] -> [K], 1 / scene unit.
+      density_fn: of the field.
       num_samples: cells looked at, drawn without regard to what they held.
       step_size: sample spacing along rays, scene units.
       decay: how fast a maximum is forgotten, in (0, 1).

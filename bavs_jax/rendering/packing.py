@@ -8,9 +8,14 @@ every slot is valid there is nothing to pack, and `evaluate_dense` goes through 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+
+# From (row [K], slot [K], valid [K]), which say what samples to evaluate and whether they count, a
+# pytree of [K, ...].
+EvaluateFn = Callable[[jax.Array, jax.Array, jax.Array], Any]
 
 
 def row_starts(sample_mask: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -62,11 +67,11 @@ def _read_back_once_bwd(places, cotangent):
 _read_back_once.defvjp(_read_back_once_fwd, _read_back_once_bwd)
 
 
-def evaluate_one_pass(fn: Callable, sample_mask: jax.Array, *, capacity: int):
+def evaluate_one_pass(fn: EvaluateFn, sample_mask: jax.Array, *, capacity: int):
     """Differentiable in reverse: as many whole rays as fit into one buffer.
 
     Args:
-      fn: (row [K], slot [K], valid [K]) -> pytree of [K, ...]; `row`, `slot` say which sample.
+      fn: evaluates K samples.
       sample_mask: [R, S] bool, the valid ones of a row first.
       capacity: K.
 
@@ -82,13 +87,10 @@ def evaluate_one_pass(fn: Callable, sample_mask: jax.Array, *, capacity: int):
     return jax.tree.map(lambda x: _read_back_once(x, starts, kept, places), packed), ray_mask
 
 
-def evaluate_all_passes(fn: Callable, sample_mask: jax.Array, *, capacity: int):
-    """Exact for any number of samples: as many buffers, one after another, as are needed.
+def evaluate_all_passes(fn: EvaluateFn, sample_mask: jax.Array, *, capacity: int):
+    """Outputs [R, S, ...] of any number of samples: as many buffers in turn as are needed.
 
     Not differentiable in reverse mode (a while loop). Arguments as in `evaluate_one_pass`.
-
-    Returns:
-      outputs as [R, S, ...].
     """
     starts, count = row_starts(sample_mask)
     total = starts[-1] + count[-1]
@@ -106,16 +108,13 @@ def evaluate_all_passes(fn: Callable, sample_mask: jax.Array, *, capacity: int):
     return jax.lax.while_loop(lambda carry: carry[0] < total, body, (jnp.int32(0), empty))[1]
 
 
-def evaluate_dense(fn: Callable, num_rays: int, num_slots: int, *, capacity: int | None):
-    """All slots in order; differentiable.
+def evaluate_dense(fn: EvaluateFn, num_rays: int, num_slots: int, *, capacity: int | None):
+    """Outputs [R, S, ...] of all slots in order; differentiable.
 
     Args:
       fn: see `evaluate_one_pass`; all slots count as valid.
       num_rays, num_slots: R and S.
       capacity: most slots at once, in groups of whole rays; None takes all at once.
-
-    Returns:
-      outputs as [R, S, ...].
     """
     group = num_rays if capacity is None else max(min(capacity // num_slots, num_rays), 1)
     slot = jnp.tile(jnp.arange(num_slots), group)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -17,12 +17,12 @@ from bavs_jax.rendering.histograms import (
     sample_histogram,
 )
 from bavs_jax.rendering.samplers import Sampler, dense_samples, field_weights
+from bavs_jax.rendering.spacing import IntervalFn
 
 ANNEAL_SLOPE = 10.0  # of Mip-NeRF 360 (Eq 18)
 
 
-@struct.dataclass
-class ProposalState:
+class ProposalState(struct.PyTreeNode):
     """How far proposals are trusted."""
 
     anneal: jax.Array  # [] exponent of their weights, from 0 (not at all) to 1
@@ -36,7 +36,7 @@ def anneal_exponent(progress: jax.Array) -> jax.Array:
 
 def make_proposal_sampler(
     proposals: Sequence[DensityField],
-    interval_fn: Callable,
+    interval_fn: IntervalFn,
     *,
     num_proposals: Sequence[int] = (64, 32),
     num_samples: int = 32,
@@ -49,7 +49,7 @@ def make_proposal_sampler(
 
     Args:
       proposals: one density field for each round before the last.
-      interval_fn: `Rays` [R] -> `Interval`, near and far of each ray and the spacing between.
+      interval_fn: near and far of each ray, and the spacing between.
       num_proposals: samples of each proposal.
       num_samples: S, what the field is read at.
       anneal_steps: optimiser steps until proposals are fully trusted.

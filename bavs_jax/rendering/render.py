@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from bavs_jax.arrays import Array
 from bavs_jax.cameras import Rays
 from bavs_jax.rendering.compositing import (
     composite,
@@ -20,46 +21,68 @@ from bavs_jax.rendering.packing import evaluate_all_passes, evaluate_dense, eval
 from bavs_jax.rendering.sampling import Samples, flatten_inputs
 
 
-@struct.dataclass
-class Rendering:
+class Rendering(struct.PyTreeNode):
     """What R rays see."""
 
     rgb: jax.Array  # [R, 3] sRGB in [0, 1]
     depth: jax.Array  # [R] distance along the ray, scene units; 0 on empty rays
     opacity: jax.Array  # [R] in [0, 1]
+    thinned: jax.Array  # [R] bool, looked at more coarsely than asked for
     channels: dict[str, jax.Array]  # each [R]
+
+
+class RayRendering(Rendering):
+    """What R rays see of a field that is sampled along them, and by which samples."""
+
+    samples: Samples  # [R, S]
     weights: jax.Array  # [R, S]
     density: jax.Array  # [R, S] 1 / scene unit, 0 in empty slots
     values: dict[str, jax.Array]  # what more the field returned at each sample, [R, S, ...]
     ray_mask: jax.Array  # [R] bool, false: the ray did not fit the buffer and must be left out
 
 
+def basic_images(rendering: Rendering) -> dict[str, jax.Array]:
+    """What every render gives: "rgb" [R, 3], "depth", "opacity" and "thinned" [R]."""
+    return {
+        "rgb": rendering.rgb,
+        "depth": rendering.depth,
+        "opacity": rendering.opacity,
+        "thinned": rendering.thinned,
+    }
+
+
+DisplaceFn = Callable[[jax.Array], jax.Array]  # offsets [K, 3] at positions [K, 3], scene units
+# A field whose parameters are fixed: from positions [K, 3], directions [K, 3] and its inputs by
+# name, what `ApplyField` says.
+FieldFn = Callable[..., tuple]
+
+
 class Channel(NamedTuple):
     """One more quantity to composite like colour: `sum_i w_i value_i + (1 - sum_i w_i) floor`."""
 
-    value_fn: Callable  # (positions [K, 3], directions [K, 3]) -> [K]
+    # [K] at positions [K, 3], scene units, that are looked at along unit directions [K, 3].
+    value_fn: Callable[[jax.Array, jax.Array], jax.Array]
     floor: float = 0.0  # what a ray sees that meets nothing
 
 
 def render_rays(
     rays: Rays,
     samples: Samples,
-    field_fn: Callable,
+    field_fn: FieldFn,
     *,
-    background,
+    background: Array | None,
     capacity: int,
     exact: bool,
     inputs: Mapping[str, jax.Array] | None = None,
-    displace_fn: Callable | None = None,
+    displace_fn: DisplaceFn | None = None,
     channels: Mapping[str, Channel] | None = None,
-) -> Rendering:
+) -> RayRendering:
     """Renders rays at given samples (Eqs 2-3).
 
     Args:
       rays: R rays.
       samples: [R, S] where to look.
-      field_fn: (positions [K, 3], directions [K, 3], **inputs) -> (density [K], rgb [K, 3]), and
-        where the field has more to say of each point, a dict of that, [K, ...], as a third.
+      field_fn: what is rendered; it is given `inputs` by name.
       background: [3] colour of what lies behind everything, or [R, 3]; None: see
         `composite_colour`.
       capacity: places of the buffer in which valid samples are evaluated.
@@ -67,12 +90,8 @@ def render_rays(
         in reverse mode; false makes one pass and marks rays that did not fit in `ray_mask`. Dense
         samples always fit: one pass then takes them all at once.
       inputs: what more the field reads at each sample, by name, [R, S, ...] (`Field.inputs`).
-      displace_fn: positions [K, 3] -> offsets [K, 3] in scene units: the deformation `D(x)`; the
-        field is read at `x + D(x)`.
+      displace_fn: the deformation `D(x)`; the field is read at `x + D(x)`.
       channels: more quantities to composite, by name; each reads the undisplaced position.
-
-    Returns:
-      `Rendering` of R rays.
     """
     channels = dict(channels or {})
     num_rays, num_slots = samples.t_mids.shape
@@ -102,7 +121,7 @@ def render_rays(
     density, rgb, extra, values = outputs
 
     weights = render_weights(density, samples.deltas)
-    return Rendering(
+    return RayRendering(
         rgb=composite_colour(weights, rgb, background),
         depth=expected_depth(weights, samples.t_mids),
         opacity=weights.sum(-1),
@@ -110,6 +129,8 @@ def render_rays(
             name: composite(weights, value[..., None], channels[name].floor)[..., 0]
             for name, value in extra.items()
         },
+        thinned=samples.thinned,
+        samples=samples,
         weights=weights,
         density=density,
         values=values,

@@ -6,11 +6,14 @@ The renderer, training, curvature and scoring know of no kind of sampler, only o
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 
+from bavs_jax.arrays import DensityFn
+from bavs_jax.cameras import Rays
+from bavs_jax.fields.base import DensityField, Field, InitParams, Params
 from bavs_jax.rendering.compositing import render_weights
 from bavs_jax.rendering.occupancy import init_occupancy, update_occupancy
 from bavs_jax.rendering.sampling import (
@@ -21,24 +24,53 @@ from bavs_jax.rendering.sampling import (
     sample_positions,
 )
 
+State = Any  # a pytree, each sampler's own: carried but not trained, such as an occupancy grid
+Aux = Any  # a pytree, each sampler's own: what its loss is made of
+
+
+class InitState(Protocol):
+    """The state of a sampler before any training."""
+
+    def __call__(self) -> State: ...
+
+
+class SampleFn(Protocol):
+    """Samples [R, S] of R rays, through which no gradient runs; jitters by the key, and takes the
+    middle of each step without one."""
+
+    def __call__(
+        self, key: jax.Array | None, params: Params, state: State, rays: Rays, /
+    ) -> tuple[Samples, Aux]: ...
+
+
+class UpdateState(Protocol):
+    """The state by what has been trained; called once before each compiled run of steps, `step` []
+    of them done."""
+
+    def __call__(
+        self, key: jax.Array, state: State, density_fn: DensityFn, step: jax.Array, /
+    ) -> State: ...
+
+
+ColourLossFn = Callable[[jax.Array], jax.Array]  # the loss [] of colours [R, 3] of the same pixels
+
+
+class SamplerLoss(Protocol):
+    """What training adds for a sampler, [], from the samples and their rendering weights [R, S]."""
+
+    def __call__(
+        self, aux: Aux, samples: Samples, weights: jax.Array, colour_loss_fn: ColourLossFn, /
+    ) -> jax.Array | float: ...
+
 
 class Sampler(NamedTuple):
-    """A way to choose samples as pure functions.
+    """A way to choose samples as pure functions."""
 
-    `init(key) -> params`, trained along with the field; {} where there is nothing to train
-    `init_state() -> state`, carried but not trained, such as an occupancy grid
-    `sample(key or None, params, state, rays) -> (Samples [R, S], aux)`; jitters by the key, and
-      takes the middle of each step without one. No gradient runs through the samples.
-    `update(key, state, density_fn, step) -> state`, once before each compiled run of steps
-    `loss(aux, samples, weights [R, S], colour_loss_fn) -> []`, what training adds;
-      `colour_loss_fn(rgb [R, 3]) -> []` compares another rendering with the same pixels
-    """
-
-    init: Callable
-    init_state: Callable
-    sample: Callable
-    update: Callable
-    loss: Callable
+    init: InitParams  # trained along with the field; {} where there is nothing to train
+    init_state: InitState
+    sample: SampleFn
+    update: UpdateState
+    loss: SamplerLoss
     num_slots: int  # S, most samples of a ray
     dense: bool  # whether every ray fills all of its slots
 
@@ -95,7 +127,9 @@ def dense_samples(t_mids: jax.Array, deltas: jax.Array, is_empty: jax.Array) -> 
     )
 
 
-def field_weights(field: Any, params, rays, samples: Samples) -> jax.Array:
+def field_weights(
+    field: DensityField | Field, params: Params, rays: Rays, samples: Samples
+) -> jax.Array:
     """Rendering weights [R, S] of a density field at samples."""
     positions = sample_positions(rays, samples)
     inputs = flatten_inputs(field.inputs(rays, samples))

@@ -20,8 +20,8 @@ from bavs_jax.rendering.sampling import box_interval
 class Spacing(NamedTuple):
     """A rising function and its inverse, of distances > 0."""
 
-    warp: Callable
-    unwarp: Callable
+    warp: Callable[[jax.Array], jax.Array]
+    unwarp: Callable[[jax.Array], jax.Array]
 
 
 def _piecewise_warp(t):
@@ -40,8 +40,7 @@ SPACINGS = {
 }
 
 
-@struct.dataclass
-class Interval:
+class Interval(struct.PyTreeNode):
     """The part of each ray that is looked at, and how steps are spaced on it."""
 
     near: jax.Array  # [R] scene units
@@ -61,6 +60,9 @@ class Interval:
     def is_empty(self) -> jax.Array:
         """[R] bool, where there is nothing to look at."""
         return self.near >= self.far
+
+
+IntervalFn = Callable[[Rays], Interval]  # what of each of R rays is looked at
 
 
 def box_intervals(rays: Rays, box, *, near: float, far: float) -> Interval:

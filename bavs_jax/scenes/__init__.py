@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 
 from bavs_jax.scenes.base import Scene, SceneError
 from bavs_jax.scenes.blender import load_blender
 from bavs_jax.scenes.capture import make_scene
-from bavs_jax.scenes.colmap import load_colmap
+from bavs_jax.scenes.colmap import load_colmap, load_mipnerf360
 from bavs_jax.scenes.detect import check_kind, detect_kind
 from bavs_jax.scenes.lightfield import load_lightfield
 from bavs_jax.scenes.llff import load_llff
-from bavs_jax.scenes.mipnerf360 import load_mipnerf360
 from bavs_jax.scenes.nerfstudio import load_nerfstudio
 from bavs_jax.scenes.procedural import load_procedural
 
-LOADERS = {
+LOADERS: dict[str, Callable[..., Scene]] = {
     "blender": load_blender,
     "nerfstudio": load_nerfstudio,
     "llff": load_llff,

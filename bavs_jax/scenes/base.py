@@ -72,22 +72,19 @@ class Scene:
 
     def image(self, view_id: int) -> np.ndarray:
         """One view as [H, W, 3] uint8."""
-        width, height = (int(n) for n in self.cameras.sizes[view_id])
-        return self.pixels[self.view_slice(view_id)].reshape(height, width, 3)
+        return self._shaped(self.pixels, view_id)
 
     def depth_image(self, view_id: int) -> np.ndarray | None:
         """One view's true depth as [H, W] float32 with 0 where unknown, or None."""
-        if self.depth is None:
-            return None
-        width, height = (int(n) for n in self.cameras.sizes[view_id])
-        return self.depth[self.view_slice(view_id)].reshape(height, width)
+        return None if self.depth is None else self._shaped(self.depth, view_id)
 
     def mask_image(self, view_id: int) -> np.ndarray | None:
         """Which pixels of a view count, [H, W] bool, or None where all do."""
-        if self.pixel_mask is None:
-            return None
+        return None if self.pixel_mask is None else self._shaped(self.pixel_mask, view_id)
+
+    def _shaped(self, table: np.ndarray, view_id: int) -> np.ndarray:
         width, height = (int(n) for n in self.cameras.sizes[view_id])
-        return self.pixel_mask[self.view_slice(view_id)].reshape(height, width)
+        return table[self.view_slice(view_id)].reshape(height, width, *table.shape[1:])
 
 
 def photo_cameras(scene: Scene, cameras: Cameras) -> Cameras:

@@ -21,14 +21,11 @@ def find_depth(image_path: pathlib.Path) -> pathlib.Path | None:
 
 
 def decode_depth(values: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Distance along the ray from an 8-bit depth image: `8 (1 - v / 255)`, 0 where unknown.
+    """Distance [H, W] along the ray from an 8-bit image, `8 (1 - v / 255)`, 0 where unknown.
 
     Args:
       values: [H, W] uint8, 0 for the background.
       alpha: [H, W] uint8 opacity of the colour image.
-
-    Returns:
-      [H, W] float32, scene units.
     """
     depth = DEPTH_RANGE * (1.0 - values.astype(np.float32) / 255.0)
     return np.where((values > 0) & (alpha > 0), depth, np.float32(0.0))
@@ -57,11 +54,12 @@ def load_split(root: pathlib.Path, split: str, *, image_size, background, strict
         raise SceneError(f"{path}: camera_angle_x: is {angle}: give radians below pi")
     for index, frame in enumerate(frames):
         checks.check_inside(root, frame["file_path"], path, f"frames[{index}].file_path")
-    files = [images.find_image(root, frame["file_path"]) for frame in frames]
-    kept = checks.keep_existing(frames, files, path, strict=strict)
+    found = [images.find_image(root, frame["file_path"]) for frame in frames]
+    kept = checks.keep_existing(frames, found, path, strict=strict)
+    files = checks.existing(found)
 
     fields = ("poses", "intrinsics", "images", "depths", "files", "names", "sizes")
-    views = {field: [] for field in fields}
+    views: dict[str, list] = {field: [] for field in fields}
     original = None
     for index in kept:
         field = f"frames[{index}].transform_matrix"

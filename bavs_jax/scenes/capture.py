@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -14,6 +14,10 @@ from bavs_jax.scenes.base import Scene, SceneError, alpha_table, pixel_table, pr
 from bavs_jax.scenes.extent import scene_extent
 from bavs_jax.scenes.poses import level_and_scale, transform_poses
 from bavs_jax.scenes.splits import choose_split
+
+Split = tuple[Sequence[int], Sequence[int]]  # views of the pool, and views to test on
+# Depth [H, W] of an image of a given (width, height), in the unit of the files.
+DepthReader = Callable[[tuple[int, int]], np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,11 +33,11 @@ class Capture:
     poses: np.ndarray  # [V, 4, 4] float64 camera-to-world, OpenGL axes
     cameras: Cameras  # [V] at the sizes of the image files
     masks: tuple[pathlib.Path, ...] = ()  # [V] or none at all
-    # [V] or none at all: (width, height) of the image -> depth along the optical axis, or None.
-    depths: tuple[Callable | None, ...] = ()
+    # [V] or none at all: of depth along the optical axis; None for a view without.
+    depths: tuple[DepthReader | None, ...] = ()
     depth_along_ray: bool = False  # the depths are distances along the rays instead
     bounds: np.ndarray | None = None  # [V, 2] depths along the axis between which content lies
-    split: tuple | None = None  # (pool, test) view ids that come with the files
+    split: Split | None = None  # what comes with the files
     user_from_file: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(4))
 
 
@@ -148,8 +152,8 @@ def mask_table(capture: Capture, cameras: Cameras, names: tuple[str, ...]) -> np
         return None if shown is None else pixel_table(shown)[0]
     table = []
     for view, path in enumerate(capture.masks):
-        size = tuple(int(n) for n in capture.cameras.sizes[view])
-        mask = maps.read_mask(path, size, capture.files[view])
+        width, height = (int(n) for n in capture.cameras.sizes[view])
+        mask = maps.read_mask(path, (width, height), capture.files[view])
         mask = maps.shrink_mask(mask, *(int(n) for n in cameras.sizes[view]))
         if shown is not None:
             mask &= shown[view]
@@ -179,7 +183,8 @@ def depth_table(capture: Capture, cameras: Cameras, unit: float) -> np.ndarray |
         if read_fn is None:
             table.append(np.zeros((height, width), np.float32))
             continue
-        depth = read_fn(tuple(int(n) for n in capture.cameras.sizes[view]))
+        full_width, full_height = (int(n) for n in capture.cameras.sizes[view])
+        depth = read_fn((full_width, full_height))
         depth = images.nearest_resize(unit * depth, width, height).astype(np.float32)
         table.append(depth if capture.depth_along_ray else maps.along_rays(depth, cameras, view))
     return pixel_table(table)[0]

@@ -6,6 +6,8 @@ import functools
 import math
 import os
 import pathlib
+from collections.abc import Callable, Sequence
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 
@@ -21,14 +23,19 @@ SIZE_TOLERANCE = 1.0  # pixels; image sizes are rounded when a data set is scale
 LARGEST, SMALLEST_FOCAL = 1e18, 1e-9
 
 
-def name_refusals(load_fn):
+Args = ParamSpec("Args")
+Loaded = TypeVar("Loaded")
+
+
+def name_refusals(load_fn: Callable[Args, Loaded]) -> Callable[Args, Loaded]:
     """Wraps a loader: what the operating system refuses becomes a `SceneError` with the file."""
 
     @functools.wraps(load_fn)
-    def load(root, *args, **options):
+    def load(*args: Args.args, **options: Args.kwargs) -> Loaded:
         try:
-            return load_fn(root, *args, **options)
+            return load_fn(*args, **options)
         except OSError as error:
+            root = args[0] if args else options.get("root")
             path, reason = error.filename or root, error.strerror or error
             raise SceneError(f"{path}: {reason}: check the file and its permissions") from error
 
@@ -205,7 +212,18 @@ def view_name(file: pathlib.Path, root: pathlib.Path) -> str:
     return printable(pathlib.PurePath(os.path.relpath(file, root)).as_posix())
 
 
-def keep_existing(frames: list, files: list, path: pathlib.Path, *, strict: bool) -> list[int]:
+def existing(files: Sequence[pathlib.Path | None]) -> dict[int, pathlib.Path]:
+    """The files that there are, by the index of their frame."""
+    return {index: file for index, file in enumerate(files) if file is not None}
+
+
+def keep_existing(
+    frames: list[dict],
+    files: Sequence[pathlib.Path | None],
+    path: pathlib.Path,
+    *,
+    strict: bool,
+) -> list[int]:
     """Indices of the frames whose image exists; one warning counts and names the others.
 
     Args:
@@ -214,13 +232,10 @@ def keep_existing(frames: list, files: list, path: pathlib.Path, *, strict: bool
       path: the transforms file, for messages.
       strict: missing images are an error rather than a warning.
 
-    Returns:
-      Indices into `frames`, in their order.
-
     Raises:
       SceneError: images are missing under `strict`, or none is left.
     """
-    kept = [index for index, file in enumerate(files) if file is not None]
+    kept = list(existing(files))
     missing = [frame["file_path"] for frame, file in zip(frames, files) if file is None]
     if not missing:
         return kept

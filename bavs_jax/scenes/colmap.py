@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import pathlib
 
@@ -12,6 +13,8 @@ from bavs_jax.scenes.base import Scene, SceneError
 from bavs_jax.scenes.capture import Capture, make_scene
 from bavs_jax.scenes.colmap_files import check_binary, check_text, count_images
 from bavs_jax.scenes.folders import image_folder, match_names
+from bavs_jax.scenes.llff import TEST_EVERY, read_llff
+from bavs_jax.scenes.splits import every_nth
 
 # Where models lie, each in a folder with a number or in this one itself.
 MODEL_PARENTS = ("sparse", "colmap/sparse", ".", "distorted/sparse")
@@ -51,12 +54,13 @@ def read_model(root: pathlib.Path):
     Raises:
       SceneError: pycolmap is not installed, there is no model, or it cannot be read.
     """
-    folder, *others = find_models(root) or [None]
-    if folder is None:
+    found = find_models(root)
+    if not found:
         raise SceneError(
             f"{root}: no COLMAP model (cameras.bin or cameras.txt) in "
             f"{', '.join(p for p in MODEL_PARENTS if p != '.')}: copy COLMAP's sparse folder here"
         )
+    folder, *others = found
     suffix = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
     for name in MODEL_FILES:
         path = folder / f"{name}{suffix}"
@@ -158,27 +162,35 @@ def read_colmap(root: pathlib.Path, *, downscale: int | None, strict: bool) -> C
     found = match_names(names, pictures)
     listed = [{"file_path": name} for name in names]
     kept = checks.keep_existing(listed, found, folder, strict=strict)
+    files = checks.existing(found)
 
     poses, intrinsics, distortion, sizes, lenses = [], [], [], [], []
     for index in kept:
         view = views[index]
         poses.append(opengl_pose(view, folder))
         lens, full, coefficients = camera_of(view.camera, folder)
-        size, stated = images.image_size(found[index]), (view.camera.width, view.camera.height)
-        intrinsics.append(models.fit_to_image(full, stated, size, found[index], folder))
+        size, stated = images.image_size(files[index]), (view.camera.width, view.camera.height)
+        intrinsics.append(models.fit_to_image(full, stated, size, files[index], folder))
         distortion.append(coefficients)
         sizes.append(size)
         lenses.append(lens)
     warn_without_pose(pictures, found, folder)
     names = [names[index] for index in kept]
     lens = models.common_lens(lenses, names, folder)
-    options = {"names": names, "path": folder, "distortion": distortion, "lens": lens}
     return Capture(
         root=root,
         source=folder,
-        files=tuple(found[index] for index in kept),
+        files=tuple(files[index] for index in kept),
         poses=np.stack(poses),
-        cameras=checks.build_cameras(poses, intrinsics, sizes, **options),
+        cameras=checks.build_cameras(
+            poses,
+            intrinsics,
+            sizes,
+            names=names,
+            path=folder,
+            distortion=distortion,
+            lens=lens,
+        ),
     )
 
 
@@ -215,3 +227,23 @@ def load_colmap(root, *, downscale: int | None = None, strict: bool = False, **o
     """
     capture = read_colmap(checks.scene_folder(root), downscale=downscale, strict=strict)
     return make_scene(capture, **options)
+
+
+@checks.name_refusals
+def load_mipnerf360(
+    root, *, downscale: int | None = None, strict: bool = False, **options
+) -> Scene:
+    """Loads a scene in the layout of Mip-NeRF 360; every 8th image is a test view.
+
+    Where there is no COLMAP model, `poses_bounds.npy` gives the poses and the bounds.
+
+    Args:
+      root: the folder of `sparse` or `poses_bounds.npy`.
+      downscale, strict, **options: as in `load_colmap`; so are the scene and its errors.
+    """
+    root = checks.scene_folder(root)
+    if find_model(root) is None and (root / "poses_bounds.npy").is_file():
+        return make_scene(read_llff(root, downscale=downscale), **options)
+    capture = read_colmap(root, downscale=downscale, strict=strict)
+    split = every_nth(len(capture.files), TEST_EVERY, path=capture.source)
+    return make_scene(dataclasses.replace(capture, split=split), **options)

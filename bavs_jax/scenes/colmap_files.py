@@ -33,7 +33,8 @@ class Bytes:
     """A binary file that is walked through from its start; its end must not come early."""
 
     def __init__(self, path: pathlib.Path):
-        self.path, self.data, self.place = path, b"", 0
+        self.path, self.place = path, 0
+        self.data: bytes | mmap.mmap = b""
         with path.open("rb") as file:
             if os.fstat(file.fileno()).st_size:  # mapped: of a large file little is looked at
                 self.data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
@@ -187,7 +188,8 @@ def check_text(folder: pathlib.Path) -> None:
             raise SceneError(f"{path}: line {line}: has {len(words)} fields: write {fields}")
         cameras.add(int(check_numbers([words[0], *words[2:]], path, line, fields)[0]))
 
-    path, seen = folder / "images.txt", {}
+    path = folder / "images.txt"
+    seen: dict[str, int] = {}
     lines = text_lines(path)
     for line, content in lines:
         words = content.split(maxsplit=9)

@@ -35,15 +35,12 @@ def has_kind(root: pathlib.Path, kind: str) -> bool:
 
 @checks.name_refusals
 def detect_kind(root) -> str:
-    """The loader for a folder: the first that fits of those that say most about a scene.
+    """A folder's key of `LOADERS`: the first that fits of those that say most about a scene.
 
     A Light Field scene looks like the layout that it is kept in, and has to be named.
 
     Args:
       root: the scene's folder.
-
-    Returns:
-      A key of `LOADERS`.
 
     Raises:
       SceneError: the folder is missing, or holds no known layout.

@@ -26,16 +26,13 @@ def scene_extent(
     unbounded: bool,
     path: pathlib.Path,
 ) -> tuple[float, float, np.ndarray]:
-    """Near, far and box of a capture; the options are those of `make_scene`.
+    """Near, far and box [2, 3] of a capture, scene units; the options are those of `make_scene`.
 
     Args:
       cameras: [V] in scene coordinates.
       bounds: [V, 2] depths along the optical axis between which content lies, scene units, or
         None where they are not known.
       path: for messages.
-
-    Returns:
-      `(near, far, box [2, 3])`, scene units.
     """
     if bounds is None:
         box = cube(BOX_HALF_SIDE if box_half_side is None else box_half_side, path)
@@ -76,8 +73,8 @@ def seen_box(
     first, last = bounds.min(), bounds.max()
     if unbounded:
         last = 2.0 / (1.0 / first + 1.0 / last)
-    seen = [cameras.positions[:, None] + depth * corners for depth in (first, last)]
-    seen = np.concatenate(seen).reshape(-1, 3)
+    ends = [cameras.positions[:, None] + depth * corners for depth in (first, last)]
+    seen = np.concatenate(ends).reshape(-1, 3)
     return np.stack([seen.min(axis=0), seen.max(axis=0)]).astype(np.float32)
 
 

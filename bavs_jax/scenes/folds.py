@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import functools
 import pathlib
-import warnings
 
 import jax
 import numpy as np
 
 from bavs_jax.cameras import Cameras, image_pixels
 from bavs_jax.lenses import LENSES, rising_radii, undistort
+from bavs_jax.scenes import images
 from bavs_jax.scenes.base import SceneError
 
 LARGEST_MISS = 0.1  # pixels between a pixel and where its own ray is seen
 NEARLY = 0.8  # of the lens's range: images that stay within it are not looked at any closer
-NAMES_IN_WARNING = 3
 
 
 def shown_pixels(intrinsics, distortion, size, *, lens: str) -> np.ndarray | None:
@@ -65,9 +64,6 @@ def shown_masks(
       names: [V] how to call the views in messages.
       path: the file that gives the lenses, for messages.
 
-    Returns:
-      [V] masks [H, W] bool, or None.
-
     Raises:
       SceneError: a view has no pixel with a direction.
     """
@@ -77,27 +73,29 @@ def shown_masks(
     kinds, kind_of = np.unique(own, axis=0, return_inverse=True)
     kind_of = kind_of.ravel()
     shown = [shown_pixels(k[:4], k[4:10], k[10:], lens=cameras.lens) for k in kinds]
-    views = [view for view, kind in enumerate(kind_of) if shown[kind] is not None]
-    if not views:
-        return None
-    for view in views:
-        if not shown[kind_of[view]].any():
+    own_masks = [shown[kind] for kind in kind_of]
+    views = []
+    for view, mask in enumerate(own_masks):
+        if mask is None:
+            continue
+        views.append(view)
+        if not mask.any():
             raise SceneError(
                 f"{path}: {names[view]}: no pixel lies within the range of its lens: "
                 "check cx, cy and the distortion"
             )
+    if not views:
+        return None
     masks = [
-        np.ones((height, width), bool) if shown[kind] is None else shown[kind]
-        for kind, (width, height) in zip(kind_of, cameras.sizes)
+        np.ones((height, width), bool) if mask is None else mask
+        for mask, (width, height) in zip(own_masks, cameras.sizes)
     ]
-    hidden = sum(np.count_nonzero(~mask) for mask in masks)
+    hidden = sum(int(np.count_nonzero(~mask)) for mask in masks)
     total = sum(mask.size for mask in masks)
-    listed = ", ".join(names[view] for view in views[:NAMES_IN_WARNING])
-    listed += ", ..." if len(views) > NAMES_IN_WARNING else ""
-    warnings.warn(
+    listed = images.some_names([names[view] for view in views])
+    images.warn(
         f"{path}: {hidden / total:.1%} of all pixels lie beyond where the lens's distortion folds "
         f"back, in {len(views)} of {len(names)} views ({listed}): left out; calibrate the lens "
-        "anew to use them",
-        stacklevel=3,
+        "anew to use them"
     )
     return masks

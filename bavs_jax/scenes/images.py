@@ -13,7 +13,7 @@ import os
 import pathlib
 import warnings
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import imageio.v3 as iio
 import numpy as np
@@ -173,7 +173,7 @@ def orientation(path: pathlib.Path) -> int:
     return value if value in range(1, 9) else 1
 
 
-def look_over(files: list[pathlib.Path], root: pathlib.Path, path: pathlib.Path) -> None:
+def look_over(files: Sequence[pathlib.Path], root: pathlib.Path, path: pathlib.Path) -> None:
     """Warns of photos that carry an EXIF orientation, and of photos that are copies of others.
 
     Args:
@@ -197,9 +197,11 @@ def look_over(files: list[pathlib.Path], root: pathlib.Path, path: pathlib.Path)
         )
 
 
-def copies(files: list[pathlib.Path]) -> list[tuple[pathlib.Path, pathlib.Path]]:
+def copies(files: Sequence[pathlib.Path]) -> list[tuple[pathlib.Path, pathlib.Path]]:
     """Pairs of files with the same content: each later one with the first."""
-    by_size, first, pairs = defaultdict(list), {}, []
+    by_size: defaultdict[int, list[pathlib.Path]] = defaultdict(list)
+    first: dict[bytes, pathlib.Path] = {}
+    pairs: list[tuple[pathlib.Path, pathlib.Path]] = []
     for file in files:
         by_size[file.stat().st_size].append(file)
     for group in by_size.values():
@@ -223,7 +225,7 @@ def warn(message: str) -> None:
 
 
 def box_filter(image: np.ndarray, size: int) -> np.ndarray:
-    """Averages along the first axis over equal intervals, for any ratio.
+    """Averages along the first axis over equal intervals, for any ratio, to [size, ...] float64.
 
     Output i is the mean over `[i, i + 1] n / size` of the step function that the n inputs are,
     taken as a difference of its integral.
@@ -231,9 +233,6 @@ def box_filter(image: np.ndarray, size: int) -> np.ndarray:
     Args:
       image: [n, ...].
       size: from 1 to n.
-
-    Returns:
-      [size, ...] float64.
     """
     num = image.shape[0]
     if not 1 <= size <= num:
@@ -249,15 +248,12 @@ def box_filter(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def area_resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Down-scales by exact area averaging, for any ratio.
+    """Down-scales by exact area averaging, for any ratio, to [height, width, C] float64.
 
     Args:
       image: [H, W, C] values that may be averaged; colour must be premultiplied by alpha.
       width: at most W, pixels.
       height: at most H, pixels.
-
-    Returns:
-      [height, width, C] float64.
     """
     if image.shape[:2] == (height, width):
         return image.astype(np.float64)
@@ -290,7 +286,9 @@ def premultiplied(image: np.ndarray) -> np.ndarray:
     return values
 
 
-def shrink_over(image: np.ndarray, width: int, height: int, background) -> np.ndarray:
+def shrink_over(
+    image: np.ndarray, width: int, height: int, background
+) -> tuple[np.ndarray, np.ndarray | None]:
     """An image at a smaller size over a background colour, as it enters the pixel table.
 
     Colour is premultiplied by alpha before it is averaged, so that the colour of invisible pixels

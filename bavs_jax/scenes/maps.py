@@ -16,15 +16,12 @@ GRAZING = 1e-3  # cosine to the optical axis below which a depth along it says n
 
 
 def read_mask(path: pathlib.Path, size: tuple[int, int], image_path: pathlib.Path) -> np.ndarray:
-    """Which pixels of an image count: black in the mask means ignored.
+    """Which pixels [H, W] of an image count: black in the mask means ignored.
 
     Args:
       path: an image file of one channel.
       size: (width, height) of the image that it belongs to, pixels.
       image_path: that image, for messages.
-
-    Returns:
-      [H, W] bool.
 
     Raises:
       SceneError: the mask is missing, damaged, coloured, of another size or black everywhere.
@@ -106,15 +103,12 @@ def compiled_rays():
 
 
 def along_rays(depth: np.ndarray, cameras: Cameras, view_id: int) -> np.ndarray:
-    """Distance along each pixel's ray from depth along the optical axis: `z / cos(angle)`.
+    """Distance [H, W] along each pixel's ray from depth along the optical axis, `z / cos(angle)`.
 
     Args:
       depth: [H, W] depth along the axis, 0 where unknown; H, W are the view's size.
       cameras: V cameras.
       view_id: which of them.
-
-    Returns:
-      [H, W] float32, 0 where unknown.
 
     Numerics: rays at right angles to the axis, and beyond, have no such depth: 0.
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pathlib
 
-from bavs_jax.scenes import checks
+from bavs_jax.scenes import checks, images
 from bavs_jax.scenes.base import SceneError
 
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")  # in the order of `Cameras.distortion`
@@ -21,7 +21,6 @@ MODELS = {
     "RADIAL_FISHEYE": ("fisheye", ("k1", "k2")),
     "OPENCV_FISHEYE": ("fisheye", ("k1", "k2", "k3", "k4")),
 }
-NAMES_IN_MESSAGE = 3
 
 
 def common_lens(lenses: list[str], names: list[str], path: pathlib.Path) -> str:
@@ -43,9 +42,7 @@ def common_lens(lenses: list[str], names: list[str], path: pathlib.Path) -> str:
         fewer, kind = (
             (others, "no fisheye") if len(others) < len(fisheyes) else (fisheyes, "fisheye")
         )
-        listed = ", ".join(fewer[:NAMES_IN_MESSAGE]) + (
-            ", ..." if len(fewer) > NAMES_IN_MESSAGE else ""
-        )
+        listed = images.some_names(fewer)
         raise SceneError(
             f"{path}: camera_model: {len(fewer)} of {len(names)} views are {kind} ({listed}) and "
             "the rest is not: load each lens as a capture of its own"

@@ -44,7 +44,8 @@ def read_intrinsics(path: pathlib.Path) -> list[float]:
 
 def read_nerfplusplus(root: pathlib.Path) -> Capture:
     """Reads camera-to-world poses with y down and z forward; the folders are the split."""
-    files, poses, intrinsics, split = [], [], [], []
+    files: list[pathlib.Path] = []
+    poses, intrinsics, split = [], [], []
     for name in SPLITS:
         folder = root / name
         if not (folder / "rgb").is_dir():
@@ -72,5 +73,5 @@ def read_nerfplusplus(root: pathlib.Path) -> Capture:
         cameras=checks.build_cameras(
             poses, intrinsics, sizes, names=[checks.view_name(f, root) for f in files], path=root
         ),
-        split=tuple(split),
+        split=(split[0], split[1]),
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from bavs_jax.scenes import checks, images, maps, texts
 from bavs_jax.scenes.base import Scene, SceneError
-from bavs_jax.scenes.capture import Capture, make_scene
+from bavs_jax.scenes.capture import Capture, DepthReader, Split, make_scene
 from bavs_jax.scenes.folders import check_downscale, scaled_names
 from bavs_jax.scenes.transforms import Frame, read_cameras
 
@@ -24,7 +24,9 @@ def find_scaled(
     return next((p for n in names if (p := images.find_image(root, n)) is not None), None)
 
 
-def find_masks(root: pathlib.Path, frames: list[Frame], downscale: int | None) -> tuple:
+def find_masks(
+    root: pathlib.Path, frames: list[Frame], downscale: int | None
+) -> tuple[pathlib.Path, ...]:
     """The mask of each frame; none where no frame names one.
 
     Raises:
@@ -50,9 +52,9 @@ def find_masks(root: pathlib.Path, frames: list[Frame], downscale: int | None) -
 
 def find_depths(
     root: pathlib.Path, frames: list[Frame], files: list[pathlib.Path], *, downscale, unit: float
-) -> tuple:
+) -> tuple[DepthReader | None, ...]:
     """How to read the depth of each frame: a function of the image's size, or None."""
-    readers = []
+    readers: list[DepthReader | None] = []
     for frame, file in zip(frames, files):
         name = frame.own.get("depth_file_path")
         if name is None:
@@ -67,7 +69,7 @@ def find_depths(
     return tuple(readers)
 
 
-def read_split(data: dict, path: pathlib.Path, names: list[str]) -> tuple | None:
+def read_split(data: dict, path: pathlib.Path, names: list[str]) -> Split | None:
     """(pool, test) view ids from `train_filenames` and `test_filenames`, or `val_filenames`.
 
     Args:
@@ -136,7 +138,8 @@ def read_nerfstudio(
     found = [find_scaled(root, frame["file_path"], downscale) for frame in listed]
     kept = checks.keep_existing(listed, found, path, strict=strict)
     kept = sorted(kept, key=lambda index: listed[index]["file_path"])
-    files = [found[index] for index in kept]
+    existing = checks.existing(found)
+    files = [existing[index] for index in kept]
     frames = [Frame(data, index, path) for index in kept]
     cameras, poses = read_cameras(frames, files)
     file_from_original, scale = applied(data, path)

@@ -26,13 +26,15 @@ def user_units(scene: Scene) -> float:
 
 def user_points(scene: Scene, positions) -> np.ndarray:
     """Points of the scene [..., 3] in the user's coordinates, float64."""
-    matrix = np.asarray(scene.user_from_scene, np.float64)
-    return np.asarray(positions, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    return _moved(np.asarray(scene.user_from_scene, np.float64), positions)
 
 
 def scene_points(scene: Scene, positions) -> np.ndarray:
     """Points in the user's coordinates [..., 3] as points of the scene, float64."""
-    matrix = np.linalg.inv(np.asarray(scene.user_from_scene, np.float64))
+    return _moved(np.linalg.inv(np.asarray(scene.user_from_scene, np.float64)), positions)
+
+
+def _moved(matrix: np.ndarray, positions) -> np.ndarray:
     return np.asarray(positions, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
@@ -96,14 +98,11 @@ def level_and_scale(poses: np.ndarray, *, scale: float | None = None) -> np.ndar
 
 
 def transform_poses(similarity: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Poses in the coordinates that a similarity leads to; their rotations stay orthonormal.
+    """Poses [V, 3, 4] where a similarity leads to, float64; rotations stay orthonormal.
 
     Args:
       similarity: [4, 4], scale times rotation and a shift.
       poses: [V, 3 or 4, 4] camera-to-world.
-
-    Returns:
-      [V, 3, 4] float64.
     """
     similarity, poses = np.asarray(similarity, np.float64), np.asarray(poses, np.float64)
     scale = np.cbrt(np.linalg.det(similarity[:3, :3]))

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bavs_jax.arrays import Array
 from bavs_jax.cameras import Cameras, hemisphere_poses, make_cameras, pixel_rays, take
 from bavs_jax.scenes import sculpture, sdf
 from bavs_jax.scenes.base import Scene, SceneError
@@ -39,9 +40,10 @@ def subpixel_offsets() -> np.ndarray:
     return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2).astype(np.float32)
 
 
-def components(vectors: jax.Array) -> sdf.Point:
+def components(vectors: Array) -> sdf.Point:
     """Components of [..., 3]."""
-    return tuple(vectors[..., i] for i in range(3))
+    vectors = jnp.asarray(vectors)
+    return vectors[..., 0], vectors[..., 1], vectors[..., 2]
 
 
 def ball_interval(
@@ -119,7 +121,8 @@ def photograph(cameras: Cameras, pixels: jax.Array, t_start: jax.Array, spread: 
     opacity = hit.astype(jnp.float32).reshape(sub, num).mean(axis=0)
 
     middle = slice(sub // 2 * num, (sub // 2 + 1) * num)
-    origins, directions = (tuple(c[middle] for c in v) for v in (origins, directions))
+    origins = origins[0][middle], origins[1][middle], origins[2][middle]
+    directions = directions[0][middle], directions[1][middle], directions[2][middle]
     t_before, t, hit = sdf.march(
         sculpture.distance,
         origins,
@@ -167,13 +170,10 @@ def capture(cameras: Cameras) -> Photos:
 
     Args:
       cameras: V cameras with any lens, outside of the object; sizes may differ.
-
-    Returns:
-      `Photos` of N pixels.
     """
     touch_fn, photograph_fn = compiled_steps()
     cameras = jax.tree.map(np.asarray, cameras)
-    sizes = cameras.sizes
+    sizes = np.asarray(cameras.sizes)
     counts = sizes.prod(axis=-1)
     view_ids = np.repeat(np.arange(len(sizes), dtype=np.int32), counts)
     row = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -181,7 +181,7 @@ def capture(cameras: Cameras) -> Photos:
     centres = np.stack([row % width + 0.5, row // width + 0.5], axis=-1).astype(np.float32)
 
     t_start, touches, spread = in_chunks(touch_fn, cameras, view_ids, [centres], CONE_CHUNK)
-    colours = np.tile(np.float32(BACKGROUND), (len(row), 1))
+    colours = np.tile(np.array(BACKGROUND, np.float32), (len(row), 1))
     opacity, depth = np.zeros(len(row), np.float32), np.zeros(len(row), np.float32)
     seen = np.flatnonzero(touches)
     if len(seen):

@@ -88,15 +88,12 @@ def distance(p: Point) -> jax.Array:
 
 
 def signed_distance(points: jax.Array) -> jax.Array:
-    """Signed distance to the object's surface: negative inside, 1-Lipschitz.
+    """Signed distance [...] to the object's surface, scene units: negative inside, 1-Lipschitz.
 
     It is a bound, not always the exact distance: cuts and unions keep it safe from above.
 
     Args:
       points: [..., 3] scene units.
-
-    Returns:
-      [...] scene units.
     """
     return distance((points[..., 0], points[..., 1], points[..., 2]))
 
@@ -104,14 +101,21 @@ def signed_distance(points: jax.Array) -> jax.Array:
 # --- paint and light -------------------------------------------------------------------------
 
 
-def mix(a, b, share: jax.Array) -> Point:
+Number = jax.Array | float
+Colour = tuple[Number, Number, Number]  # sRGB components, one number for all points or an array
+
+
+def mix(a: Colour, b: Colour, share: jax.Array) -> Point:
     """Colour between `a` (share 0) and `b` (share 1)."""
-    return tuple(x + (y - x) * share for x, y in zip(a, b))
+    red, green, blue = (x + (y - x) * share for x, y in zip(a, b))
+    return red, green, blue
 
 
 def rainbow(phase: jax.Array) -> Point:
     """A saturated colour from a phase with period 1."""
-    return tuple(0.58 + 0.42 * jnp.cos(2.0 * jnp.pi * (phase + s)) for s in (0.0, 0.35, 0.7))
+    shifts = (0.0, 0.35, 0.7)
+    red, green, blue = (0.58 + 0.42 * jnp.cos(2.0 * jnp.pi * (phase + s)) for s in shifts)
+    return red, green, blue
 
 
 def paint_plinth(q: Point) -> Point:
@@ -134,9 +138,9 @@ def paint_tower(q: Point) -> Point:
     colour = mix(colour, mosaic, in_coffer.astype(q[0].dtype))
     depth = sdf.along_segment(q, *POCKET[:2])
     rings = 0.85 + 0.15 * jnp.sign(jnp.sin(60.0 * depth))
-    pocket = tuple(c * rings for c in mix(AMBER, MAROON, depth))
+    red, green, blue = (c * rings for c in mix(AMBER, MAROON, depth))
     in_pocket = (sdf.capsule(q, *POCKET) < 0.004).astype(q[0].dtype)
-    return mix(colour, pocket, in_pocket)
+    return mix(colour, (red, green, blue), in_pocket)
 
 
 def paint_hook(q: Point) -> Point:
@@ -148,14 +152,23 @@ def paint_hook(q: Point) -> Point:
     return mix(RED, IVORY, (jnp.sin(along * (2.0 * jnp.pi / 0.12)) > 0.0).astype(u.dtype))
 
 
-def paint(q: Point) -> tuple[Point, jax.Array]:
+def paint(q: Point) -> tuple[Colour, jax.Array]:
     """Albedo (sRGB components) and strength of the highlight, in the tower's frame."""
-    colours = [paint_plinth(q), paint_tower(q), paint_hook(q), PURPLE, CYAN, GOLD]
+    colours: list[Colour] = [
+        paint_plinth(q),
+        paint_tower(q),
+        paint_hook(q),
+        PURPLE,
+        CYAN,
+        GOLD,
+    ]
     gloss = [0.05, 0.25, 0.35, 0.6, 0.6, 0.7]
-    nearest, albedo, shine = jnp.full_like(q[0], jnp.inf), CREAM, jnp.zeros_like(q[0])
+    nearest, shine = jnp.full_like(q[0], jnp.inf), jnp.zeros_like(q[0])
+    albedo: Colour = CREAM
     for part, colour, strength in zip(part_distances(q), colours, gloss):
         closer = part < nearest
-        albedo = tuple(jnp.where(closer, c, a) for c, a in zip(colour, albedo))
+        red, green, blue = (jnp.where(closer, c, a) for c, a in zip(colour, albedo))
+        albedo = red, green, blue
         shine = jnp.where(closer, strength, shine)
         nearest = jnp.minimum(nearest, part)
     return albedo, shine
@@ -184,18 +197,17 @@ def shade(p: Point, directions: Point) -> Point:
     mirror = sum((d - 2.0 * along * n) * s for d, n, s in zip(directions, normal, SUN))
     highlight = shine * jnp.maximum(mirror, 0.0) ** 20 * (facing > 0.0)
     light = openness * (0.62 + 0.10 * normal[2] + 0.45 * diffuse)
-    return tuple(jnp.clip(a * light + highlight * openness, 0.0, 1.0) for a in albedo)
+    red, green, blue = (jnp.clip(a * light + highlight * openness, 0.0, 1.0) for a in albedo)
+    return red, green, blue
 
 
 def surface_colour(points: jax.Array, directions: jax.Array) -> jax.Array:
-    """Colour that leaves the surface towards a viewer, with its view-dependent highlight.
+    """Colour [..., 3] that leaves the surface to a viewer, with its view-dependent highlight.
 
     Args:
       points: [..., 3] on the surface, scene units.
       directions: [..., 3] unit, from the viewer to the point.
-
-    Returns:
-      [..., 3] sRGB in [0, 1].
     """
-    p, d = (tuple(a[..., i] for i in range(3)) for a in (points, directions))
+    p = points[..., 0], points[..., 1], points[..., 2]
+    d = directions[..., 0], directions[..., 1], directions[..., 2]
     return jnp.stack(jnp.broadcast_arrays(*shade(p, d)), axis=-1)

@@ -107,7 +107,8 @@ def fold(a: jax.Array, period: float, count: int) -> jax.Array:
 
 def at(origins: Point, directions: Point, t: jax.Array) -> Point:
     """The point at distance `t` along each ray."""
-    return tuple(o + t * d for o, d in zip(origins, directions))
+    x, y, z = (o + t * d for o, d in zip(origins, directions))
+    return x, y, z
 
 
 def march(
@@ -191,9 +192,11 @@ def normals(distance_fn: DistanceFn, p: Point, step: float = 1e-3) -> Point:
     # A loop rather than four calls: the distance is compiled once, and its result kept.
     def add(k, gradient):
         corner = corners[k]
-        value = distance_fn(tuple(a + step * corner[i] for i, a in enumerate(p)))
+        x, y, z = (a + step * corner[i] for i, a in enumerate(p))
+        value = distance_fn((x, y, z))
         return tuple(g + corner[i] * value for i, g in enumerate(gradient))
 
     gradient = jax.lax.fori_loop(0, corners.shape[0], add, tuple(jnp.zeros_like(a) for a in p))
     length = norm(*gradient)
-    return tuple(g / length for g in gradient)
+    x, y, z = (g / length for g in gradient)
+    return x, y, z

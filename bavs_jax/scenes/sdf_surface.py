@@ -8,9 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+# A distance [...] of points [..., 3] to a surface, or a bound on it: 1-Lipschitz, negative inside.
+SignedDistance = Callable[[jax.Array], jax.Array]
+
 
 def value_and_gradient(
-    signed_distance: Callable, points: jax.Array, *, step: float
+    signed_distance: SignedDistance, points: jax.Array, *, step: float
 ) -> tuple[jax.Array, jax.Array]:
     """A distance [K] at points [K, 3], and its gradient [K, 3] from the corners of a tetrahedron.
 
@@ -24,12 +27,12 @@ def value_and_gradient(
 
 
 def project_to_surface(
-    signed_distance: Callable, points: jax.Array, *, step: float, num_steps: int = 4
+    signed_distance: SignedDistance, points: jax.Array, *, step: float, num_steps: int = 4
 ) -> tuple[jax.Array, jax.Array]:
     """Newton steps along the gradient, `p <- p - f grad f / |grad f|^2`.
 
     Args:
-      signed_distance: points [..., 3] -> [...].
+      signed_distance: whose surface it is.
       points: [K, 3] near to the surface.
       step: of the differences that give the gradient; well below the size of what is there.
       num_steps: how many.
@@ -54,7 +57,9 @@ def project_to_surface(
     return jax.lax.fori_loop(0, num_steps, newton, (points, unknown))
 
 
-def cells_near_surface(signed_distance: Callable, box, *, band: float, cells: int) -> np.ndarray:
+def cells_near_surface(
+    signed_distance: SignedDistance, box, *, band: float, cells: int
+) -> np.ndarray:
     """Lower corners [M, 3] of those of `cells^3` equal cells that may hold points within `band`.
 
     A distance changes by no more than the way: no cell that holds one is left out.
@@ -70,7 +75,7 @@ def cells_near_surface(signed_distance: Callable, box, *, band: float, cells: in
 
 def sample_surface(
     key: jax.Array,
-    signed_distance: Callable,
+    signed_distance: SignedDistance,
     box,
     num: int,
     *,
@@ -79,7 +84,7 @@ def sample_surface(
     cells: int = 64,
     chunk: int = 1 << 15,
 ) -> np.ndarray:
-    """Points uniform over the area of a surface within a box.
+    """Points [N, 3] uniform over the area of a surface within a box.
 
     Points that are uniform in a thin shell around the surface are moved onto it: where the shell is
     equally thick, as many arrive on any two pieces of equal area. At edges and where the surface
@@ -87,16 +92,13 @@ def sample_surface(
 
     Args:
       key: random key.
-      signed_distance: points [..., 3] -> [...], 1-Lipschitz, negative inside.
+      signed_distance: whose surface it is.
       box: [2, 3] that holds the surface.
       num: N, how many points.
       band: half thickness of the shell, unit of the box.
       tolerance: largest distance to the surface of what is returned.
       cells: per side of a grid; those far from the surface are not drawn from.
       chunk: points of one draw.
-
-    Returns:
-      [N, 3] float32.
 
     Raises:
       ValueError: the box holds no surface, or the Newton steps do not arrive at it.
@@ -118,11 +120,13 @@ def sample_surface(
         moved, first = project_to_surface(signed_distance, points, step=0.1 * band)
         return moved, (first < band) & (jnp.abs(signed_distance(moved)) <= tolerance)
 
-    corners = jnp.asarray(corners, jnp.float32)
+    cell_corners = jnp.asarray(corners, jnp.float32)
     # A shell is at least a thousandth of the cells around it, unless nothing arrives.
-    most, found, count = 10 + 1000 * num // chunk, [np.zeros((0, 3), np.float32)], 0
+    most, count = 10 + 1000 * num // chunk, 0
+    found: list[np.ndarray] = [np.zeros((0, 3), np.float32)]
     for number in range(most):
-        points, value = (np.asarray(x) for x in draw(jax.random.fold_in(key, number), corners))
+        drawn = draw(jax.random.fold_in(key, number), cell_corners)
+        points, value = (np.asarray(x) for x in drawn)
         # A gradient of at most 1 makes |f| a lower bound of the first-order distance.
         near = points[np.abs(value) < band]
         # How many are near differs from draw to draw; padded to a power of two, few compile.

@@ -92,7 +92,8 @@ def choose_split(
     if test_every is not None:
         return every_nth(num_views, test_every, path=path)
     if pool_size is None and own_split is not None:
-        return listed_split(*own_split, num_views, path=path)
+        pool, test = own_split
+        return listed_split(pool, test, num_views, path=path)
     if pool_size is None:
         pool_size = min(round(DEFAULT_POOL * num_views), num_views - 1)
     return random_split(num_views, pool_size, seed=seed, path=path)

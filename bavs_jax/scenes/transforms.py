@@ -102,5 +102,13 @@ def read_cameras(frames: list[Frame], files: list[pathlib.Path]) -> tuple[Camera
         lenses.append(lens_of(frame, distortion[-1]))
     names = [frame.own["file_path"] for frame in frames]
     lens = models.common_lens(lenses, names, frames[0].path)
-    options = {"names": names, "path": frames[0].path, "distortion": distortion, "lens": lens}
-    return checks.build_cameras(poses, intrinsics, sizes, **options), np.stack(poses)
+    cameras = checks.build_cameras(
+        poses,
+        intrinsics,
+        sizes,
+        names=names,
+        path=frames[0].path,
+        distortion=distortion,
+        lens=lens,
+    )
+    return cameras, np.stack(poses)

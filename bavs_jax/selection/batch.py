@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bavs_jax.arrays import Array
 from bavs_jax.selection.context import Context, SelectionError, mark_picked
 from bavs_jax.selection.distances import (
     FilterInfo,
@@ -19,7 +19,7 @@ from bavs_jax.selection.distances import (
     nearest_distances,
 )
 from bavs_jax.selection.information import BatchBound
-from bavs_jax.selection.policy import MODES, Mode, Policy
+from bavs_jax.selection.policy import MODES, Mode, Policy, UpdateFn
 
 
 class SelectionInfo(NamedTuple):
@@ -38,16 +38,13 @@ class SelectionInfo(NamedTuple):
 
 
 def top_k(scores: jax.Array, mask: jax.Array, view_ids: jax.Array, *, k: int) -> jax.Array:
-    """Indices of the k largest scores within `mask` (Eq 15), ties to the smallest view id.
+    """Indices [k] of the largest scores in `mask` (Eq 15), best first; ties to the smallest id.
 
     Args:
       scores: [C] larger is better; not NaN within `mask`, anything outside.
       mask: [C] bool with at least k set.
       view_ids: [C] int, distinct.
       k: static, 1 .. C.
-
-    Returns:
-      [k] int, from the largest score down.
     """
     return jnp.lexsort((view_ids, -scores, ~mask))[:k]
 
@@ -84,17 +81,24 @@ def select_batch(
     return top_k(scores, survivors, view_ids, k=k), survivors, info
 
 
-def make_select_batch_fn(k: int) -> Callable:
+class SelectBatchFn(Protocol):
+    """See `make_select_batch_fn`."""
+
+    def __call__(
+        self, scores: Array, ctx: Context, *, radii: Radii | None = None
+    ) -> tuple[jax.Array, jax.Array, FilterInfo]: ...
+
+
+def make_select_batch_fn(k: int) -> SelectBatchFn:
     """Jits `select_batch` for one batch size: filter and top-k in one function of fixed shapes.
 
     Runs take `acquire`: the same two steps compiled apart, since scores cost something and only
     those of the survivors are made, in between.
 
     Returns:
-      `select_batch_fn(scores [C], ctx, *, radii=None) -> (selected [k], survivors [C],
-      FilterInfo)`, for scores that are at hand for all candidates. It raises SelectionError if a
-      score in `ctx.mask` is NaN, or if k is more than `ctx.mask` has; `radii` default to
-      `default_radii`.
+      `select_batch_fn(scores [C], ctx, radii=None)`, which gives what `select_batch` does; `radii`
+      default to `default_radii`. It raises SelectionError if a score in `ctx.mask` is NaN, or if k
+      is more than `ctx.mask` has.
     """
     jitted = jax.jit(select_batch, static_argnums=3)
 
@@ -191,14 +195,17 @@ def _choose_top_k(policy: Policy, key, ctx: Context, k: int):
 
 
 def _choose_greedily(policy: Policy, key, ctx: Context, k: int):
-    selected, selected_scores, first_scores = [], [], None
+    update_fn = _update_fn(policy)
+    selected: list[int] = []
+    selected_scores: list[float] = []
+    first_scores = None
     for _ in range(k):
         scores = _checked_scores(policy.score_fn(key, ctx), ctx)
         first_scores = scores if first_scores is None else first_scores
         index = int(_top_k_fn(scores, ctx.mask, ctx.view_ids, k=1)[0])
         selected.append(index)
         selected_scores.append(scores[index])
-        ctx = policy.update_fn(mark_picked(ctx, index), index)
+        ctx = update_fn(mark_picked(ctx, index), index)
     return np.array(selected), first_scores, np.array(selected_scores)
 
 
@@ -239,11 +246,17 @@ def _as_radii(radii: Radii | None, ctx: Context) -> Radii:
 def _check_mode(policy: Policy, mode: str) -> None:
     if mode not in MODES:
         raise SelectionError(f"mode: unknown {mode!r}; use one of {', '.join(MODES)}")
-    if mode == "greedy" and policy.update_fn is None:
+    if mode == "greedy":
+        _update_fn(policy)
+
+
+def _update_fn(policy: Policy) -> UpdateFn:
+    if policy.update_fn is None:
         raise SelectionError(
             f"mode: {policy.name!r} has no update between picks, so 'greedy' would be 'top_k'; "
             "use 'top_k'"
         )
+    return policy.update_fn
 
 
 def _check_available(k: int, mask) -> None:

@@ -3,19 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Literal, Protocol, overload
 
-import jax
 import numpy as np
 from flax import struct
+
+from bavs_jax.arrays import Array
+
+if TYPE_CHECKING:  # both import this module
+    from bavs_jax.selection.directional import DirectionalInformation
+    from bavs_jax.selection.information import Information
 
 
 class SelectionError(ValueError):
     """A selection that cannot be made: one line that names the cause and the fix."""
 
 
-@struct.dataclass
-class Context:
+class SourceFn(Protocol):
+    """One number for each of the candidates `indices` [n], float [n]; made when it is asked for."""
+
+    def __call__(self, indices: np.ndarray, /) -> Array: ...
+
+
+# Eq 15: mean uncertainty [n] of renders of candidates [n], where those marked [C] are picked.
+MeanUncertaintyFn = Callable[[np.ndarray, Array], Array]
+
+
+class Context(struct.PyTreeNode):
     """C candidate cameras, the V views that may be trained on, and sources of scores.
 
     All arrays keep their shapes while views are added: only the masks change. The callables close
@@ -28,21 +42,20 @@ class Context:
     cost anything.
     """
 
-    positions: jax.Array  # [C, 3] candidate camera centres, scene units
-    view_ids: jax.Array  # [C] int32, distinct, >= 0: settle ties and seed random draws
-    mask: jax.Array  # [C] bool, which candidates may be picked now
-    picked: jax.Array  # [C] bool, the batch chosen so far; kept by `acquire`
-    training_positions: jax.Array  # [V, 3] scene units
-    is_training_view: jax.Array  # [V] bool
-    centre: jax.Array  # [3] scene centre, scene units
-    # Eq 15: (candidates int [n], picked [C]) -> mean uncertainty of their renders, float [n].
-    mean_uncertainty_fn: Callable | None = struct.field(pytree_node=False, default=None)
+    positions: Array  # [C, 3] candidate camera centres, scene units
+    view_ids: Array  # [C] int32, distinct, >= 0: settle ties and seed random draws
+    mask: Array  # [C] bool, which candidates may be picked now
+    picked: Array  # [C] bool, the batch chosen so far; kept by `acquire`
+    training_positions: Array  # [V, 3] scene units
+    is_training_view: Array  # [V] bool
+    centre: Array  # [3] scene centre, scene units
+    mean_uncertainty_fn: MeanUncertaintyFn | None = struct.field(pytree_node=False, default=None)
     # The posterior of the field and what each candidate would add to it (`information.py`).
-    information: Any = struct.field(pytree_node=False, default=None)
+    information: Information | None = struct.field(pytree_node=False, default=None)
     # What views told about each side of the field (`directional.py`).
-    directional: Any = struct.field(pytree_node=False, default=None)
-    # Candidate indices int [n] -> mean squared error of their renders against their photos [n].
-    true_error_fn: Callable | None = struct.field(pytree_node=False, default=None)
+    directional: DirectionalInformation | None = struct.field(pytree_node=False, default=None)
+    # Mean squared errors of renders of candidates against their photos.
+    true_error_fn: SourceFn | None = struct.field(pytree_node=False, default=None)
 
 
 def make_context(
@@ -53,12 +66,12 @@ def make_context(
     centre,
     view_ids=None,
     mask=None,
-    mean_uncertainty_fn: Callable | None = None,
-    information: Any = None,
-    directional: Any = None,
-    true_error_fn: Callable | None = None,
+    mean_uncertainty_fn: MeanUncertaintyFn | None = None,
+    information: Information | None = None,
+    directional: DirectionalInformation | None = None,
+    true_error_fn: SourceFn | None = None,
 ) -> Context:
-    """Checks and builds a `Context`, on the host.
+    """Checks and builds a `Context` with nothing picked yet, on the host.
 
     Args:
       positions: [C, 3] candidate camera centres, scene units.
@@ -68,9 +81,6 @@ def make_context(
       view_ids: [C] distinct integers >= 0; default 0 .. C - 1.
       mask: [C] bool, which candidates may be picked; default all.
       mean_uncertainty_fn, information, directional, true_error_fn: see `Context`.
-
-    Returns:
-      A `Context` with nothing picked yet.
 
     Raises:
       SelectionError: on a wrong shape, a position that is not finite, or repeated view ids.
@@ -110,6 +120,14 @@ def make_context(
     )
 
 
+@overload
+def require(ctx: Context, field: Literal["mean_uncertainty_fn"]) -> MeanUncertaintyFn: ...
+@overload
+def require(ctx: Context, field: Literal["information"]) -> Information: ...
+@overload
+def require(ctx: Context, field: Literal["directional"]) -> DirectionalInformation: ...
+@overload
+def require(ctx: Context, field: Literal["true_error_fn"]) -> SourceFn: ...
 def require(ctx: Context, field: str):
     """The field of `ctx` with that name; raises SelectionError if the caller gave none."""
     value = getattr(ctx, field)
@@ -124,12 +142,12 @@ def mark_picked(ctx: Context, index: int) -> Context:
     return ctx.replace(mask=np.asarray(ctx.mask) & ~is_pick, picked=ctx.picked | is_pick)
 
 
-def score_candidates(ctx: Context, source_fn: Callable) -> np.ndarray:
+def score_candidates(ctx: Context, source_fn: SourceFn) -> np.ndarray:
     """Scores [C] from a source that is asked only for the candidates in `mask`; NaN elsewhere.
 
     Args:
       ctx: the candidates.
-      source_fn: candidate indices int [n] -> scores [n].
+      source_fn: gives the scores.
 
     Raises:
       SelectionError: if the source returns another shape than [n].

@@ -15,13 +15,14 @@ grows, looks from different sides become independent.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bavs_jax.arrays import Array, Indices
 from bavs_jax.numerics import safe_divide
 from bavs_jax.selection.information import DEFAULT_MAX_BYTES, log_det_gain
 
@@ -32,18 +33,22 @@ GROUP_SIZE = 32  # candidates that a look is added to at once
 class Look(NamedTuple):
     """The curvature of one view, where it stands."""
 
-    rows: jax.Array  # [n] int32, vertices of the grid; padded as in `sparse_curvature`
-    h: jax.Array  # [n, 3] >= 0
-    position: jax.Array  # [3] scene units
+    rows: Array  # [n] int32, vertices of the grid; padded as in `sparse_curvature`
+    h: Array  # [n, 3] >= 0
+    position: Array  # [3] scene units
+
+
+LookFn = Callable[[Indices], Iterable[Look]]  # the look of each candidate, one after another
+# From the looks so far, a precision [n, 3] > 0 at the rows of each candidate, one after another.
+PrecisionFn = Callable[[tuple[Look, ...], Indices], Iterable[jax.Array]]
 
 
 class DirectionalInformation(NamedTuple):
     """The looks so far, and what each candidate would add to them."""
 
     looks: tuple[Look, ...]  # of the training views, then of the picks
-    look_fn: Callable  # candidate indices -> one `Look` after another
-    # (looks, candidate indices) -> one precision [n, 3] > 0 after another, at the candidate's rows.
-    precision_fn: Callable
+    look_fn: LookFn
+    precision_fn: PrecisionFn
 
 
 def same_side(points, camera, other, *, sharpness: float = SHARPNESS) -> jax.Array:
@@ -79,13 +84,13 @@ def _dense(rows, h, like):
 
 
 def make_precision_fn(
-    look_fn: Callable,
+    look_fn: LookFn,
     vertices,
     *,
     prior: float,
     sharpness: float = SHARPNESS,
     max_bytes: int = DEFAULT_MAX_BYTES,
-) -> Callable:
+) -> PrecisionFn:
     """Makes `DirectionalInformation.precision_fn`, which remembers what it has added up.
 
     A greedy batch asks again after each pick, with one more look: then only that look is added.

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from bavs_jax.arrays import Array
+
 DEFAULT_RADIUS = 0.2  # of the median camera distance from the scene centre
 DEFAULT_SHRINK = 0.8
 DEFAULT_MAX_SHRINKS = 32  # radii end at 0.8^32 < 1e-3 of where they began
@@ -15,8 +17,8 @@ DEFAULT_MAX_SHRINKS = 32  # radii end at 0.8^32 < 1e-3 of where they began
 class Radii(NamedTuple):
     """How far apart the max-min distance filter keeps cameras, scene units."""
 
-    min_train_distance: jax.Array  # [] from a candidate to every training view
-    min_candidate_distance: jax.Array  # [] between two candidates
+    min_train_distance: Array  # [] from a candidate to every training view
+    min_candidate_distance: Array  # [] between two candidates
 
 
 class FilterInfo(NamedTuple):
@@ -29,14 +31,11 @@ class FilterInfo(NamedTuple):
 
 
 def pairwise_distances(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Euclidean distances `|a_n - b_m|`.
+    """Euclidean distances `|a_n - b_m|`, [..., N, M] scene units.
 
     Args:
       a: [..., N, 3] scene units.
       b: [..., M, 3] scene units.
-
-    Returns:
-      [..., N, M] scene units.
     """
     # By differences, not |a|^2 + |b|^2 - 2 a.b: that loses near neighbours to cancellation.
     difference = a[..., :, None, :] - b[..., None, :, :]
@@ -44,15 +43,12 @@ def pairwise_distances(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def nearest_distances(points: jax.Array, others: jax.Array, is_valid: jax.Array) -> jax.Array:
-    """Distance of each point to the nearest valid one of others.
+    """Distance [C] of each point to the nearest valid one of others; infinity where none is valid.
 
     Args:
       points: [C, 3] scene units.
       others: [V, 3] scene units.
       is_valid: [V] bool.
-
-    Returns:
-      [C] scene units; infinity where nothing is valid.
     """
     return masked_nearest(pairwise_distances(points, others), is_valid)
 
@@ -80,9 +76,6 @@ def default_radii(
       training_positions: [V, 3] scene units.
       is_training_view: [V] bool, which of them count.
       centre: [3] scene units.
-
-    Returns:
-      `Radii`, both equal, scene units.
     """
     cameras = jnp.concatenate([positions, training_positions])
     counts = jnp.concatenate([mask, is_training_view])

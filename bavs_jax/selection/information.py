@@ -7,27 +7,38 @@ photographed: Gauss-Newton curvature (`curvature.WEIGHTINGS`: "eq13") needs its 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from bavs_jax.arrays import Array, Indices
 from bavs_jax.selection.context import SelectionError
 
 MIN_ROWS = 1024  # smallest padded size, so that views which see little share one compilation
 DEFAULT_MAX_BYTES = 2**30
 
 
+class CurvatureFn(Protocol):
+    """One (rows [n] int32, h [n, 3] >= 0) after another: the curvature that each candidate adds at
+    vertices `rows` of the grid; n is a power of two, filled up with rows = 0, h = 0."""
+
+    def __call__(self, indices: Indices, /) -> Iterable[tuple[Array, Array]]: ...
+
+
+DenseCurvatureFn = Callable[[np.ndarray], Array]  # what each of n candidates adds to H, [n, G, 3]
+# Gain [] >= 0 of a view that adds h [n, 3] to the precision [n, 3].
+Gain = Callable[[jax.Array, jax.Array], jax.Array]
+
+
 class Information(NamedTuple):
     """What is known about the field, and what each candidate would add."""
 
     precision: jax.Array  # [G, 3] H > 0, the prior and all picks so far included
-    # Candidate indices -> one (rows [n] int32, h [n, 3] >= 0) after another: the curvature that
-    # each adds at vertices `rows` of the grid; n is a power of two, filled up with rows = 0, h = 0.
-    curvature_fn: Callable
+    curvature_fn: CurvatureFn
 
 
 class BatchBound(NamedTuple):
@@ -62,12 +73,12 @@ def sparse_curvature(h) -> tuple[np.ndarray, np.ndarray]:
 
 
 def make_cached_curvature_fn(
-    dense_fn: Callable,
+    dense_fn: DenseCurvatureFn,
     *,
     num_vertices: int,
     max_bytes: int = DEFAULT_MAX_BYTES,
     group_size: int = 1,
-) -> Callable:
+) -> CurvatureFn:
     """Makes an `Information.curvature_fn` that remembers as many candidates as fit.
 
     A greedy batch asks for all candidates once for each pick, in the same order: to forget the
@@ -75,7 +86,7 @@ def make_cached_curvature_fn(
     and what no longer fits is computed anew each time, a few candidates at once.
 
     Args:
-      dense_fn: candidate indices [n] -> h [n, G, 3], what each candidate adds to H.
+      dense_fn: what each candidate adds to H.
       num_vertices: G.
       max_bytes: of host memory that remembered curvature may take.
       group_size: most candidates that `dense_fn` is asked for at once.
@@ -84,9 +95,10 @@ def make_cached_curvature_fn(
       `curvature_fn(indices)`, a generator of `(rows [n], h [n, 3])` in the order of the indices; it
       raises SelectionError where `dense_fn` returns another shape than [n, G, 3].
     """
-    kept, room = {}, max_bytes
+    kept: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    room = max_bytes
 
-    def look_at(indices) -> dict:
+    def look_at(indices: list[int]) -> dict[int, tuple[np.ndarray, np.ndarray]]:
         nonlocal room
         h = np.asarray(dense_fn(np.array(indices)))
         if h.shape != (len(indices), num_vertices, 3):
@@ -124,9 +136,6 @@ def log_det_gain(h: jax.Array, precision: jax.Array) -> jax.Array:
     Args:
       h: [n, 3] >= 0, curvature that the view adds.
       precision: [n, 3] > 0, H at the same vertices.
-
-    Returns:
-      [] >= 0.
     """
     return jnp.log1p(h / precision).sum()
 
@@ -150,16 +159,13 @@ def _add_at(precision, rows, h):
     return precision.at[rows].add(h)
 
 
-def candidate_gains(information: Information, indices, *, gain: Callable) -> np.ndarray:
-    """Gain of each candidate by itself, given all that is in `information`.
+def candidate_gains(information: Information, indices, *, gain: Gain) -> np.ndarray:
+    """Gain [n] >= 0 of each candidate by itself, given all that is in `information`.
 
     Args:
       information: the field and the candidates.
       indices: [n] int, candidates.
       gain: `log_det_gain` or `trace_ratio_gain`; compiled once for each padded size.
-
-    Returns:
-      [n] float32 >= 0.
     """
     gains = [
         float(_gain_at(information.precision, rows, h, gain=gain))
@@ -194,9 +200,6 @@ def batch_upper_bound(information: Information, selected, candidates) -> BatchBo
       information: before the first pick.
       selected: [k] int, the batch in the order of picking.
       candidates: [n] int, what the best batch may be made of; holds all of `selected`.
-
-    Returns:
-      `BatchBound`.
 
     Raises:
       SelectionError: if a pick is not among the candidates.

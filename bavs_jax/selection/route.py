@@ -8,7 +8,7 @@ EXACT_PLACES = 12  # up to here by dynamic programming: 2^12 * 12^2 steps
 
 
 def shortest_route(start, places, *, exact_places: int = EXACT_PLACES) -> np.ndarray:
-    """In which order to visit places, beginning at `start` and ending anywhere.
+    """In which order [N] to visit places, beginning at `start` and ending anywhere.
 
     Up to `exact_places` places the order is the best there is (Held and Karp 1962); beyond, it is
     the nearest-neighbour order improved by 2-opt and moves of short runs, which no single such
@@ -18,9 +18,6 @@ def shortest_route(start, places, *, exact_places: int = EXACT_PLACES) -> np.nda
       start: [3] where the route begins.
       places: [N, 3] in the same unit.
       exact_places: up to how many places the exact way is taken.
-
-    Returns:
-      [N] int, the order of visiting.
     """
     points = np.concatenate([np.asarray(start, float)[None], np.asarray(places, float)])
     cost = np.linalg.norm(points[:, None] - points[None], axis=-1)
@@ -37,15 +34,12 @@ def route_length(start, places, order) -> float:
 
 
 def held_karp(cost: np.ndarray) -> np.ndarray:
-    """The best open tour by dynamic programming over sets of visited places.
+    """The best open tour [N] by dynamic programming over sets of visited places.
 
     `best[S, j] = min_{i in S} best[S - j, i] + cost[i, j]`, in O(2^N N^2) time.
 
     Args:
       cost: [N + 1, N + 1] >= 0; row and column 0 belong to the start.
-
-    Returns:
-      [N] int, the order of places 0 .. N - 1.
     """
     num = len(cost) - 1
     between, from_start = cost[1:, 1:], cost[0, 1:]
@@ -87,9 +81,6 @@ def improve(cost: np.ndarray, order: np.ndarray) -> np.ndarray:
     Args:
       cost: as in `held_karp`, symmetric.
       order: [N] int, the order to start from.
-
-    Returns:
-      [N] int.
     """
     path = [0, *(np.asarray(order) + 1).tolist()]
 

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+
+from bavs_jax.arrays import Array
+from bavs_jax.selection.context import SourceFn
+
+State = TypeVar("State")  # what scores follow from, such as a `jac_sq_sum`
 
 
 class Worth(NamedTuple):
     """Scores along a batch of k picks; only reports."""
 
     picked: np.ndarray  # [k] score of each pick, given those before it
-    best_left: np.ndarray  # [k + 1] best score of the rest, before the first and after each pick
+    best_left: np.ndarray  # [k + 1] best score of the rest, before and after each pick; NaN: none
 
 
 def worth_along(
-    state: Any,
+    state: State,
     picks,
     scores,
     *,
-    add_fn: Callable,
-    score_fn: Callable,
+    add_fn: Callable[[State, int], State],
+    score_fn: Callable[[State, np.ndarray], Array],
     batch: int = 4,
 ) -> Worth:
     """Scores of the picks and of the best candidate left, as if the picks had been taken.
@@ -32,18 +37,16 @@ def worth_along(
     (the accelerated greedy of Minoux 1978).
 
     Args:
-      state: what the scores follow from, such as a `jac_sq_sum`.
+      state: what the scores follow from, before the first pick.
       picks: [k] int, candidates in the order of picking.
       scores: [C] score of each candidate before the first pick; NaN: not allowed.
-      add_fn: (state, candidate) -> state after it has been taken.
-      score_fn: (state, candidates int [n]) -> scores [n], which may only fall as views are added.
+      add_fn: the state after a candidate has been taken.
+      score_fn: scores [n] of n candidates, which may only fall as views are added.
       batch: candidates scored at once.
-
-    Returns:
-      `Worth`; NaN where no candidate is left.
     """
     bound = np.array(scores, np.float64)
-    picked, best_left = [], [_largest(bound)]
+    picked: list[float] = []
+    best_left = [_largest(bound)]
     for pick in picks:
         picked.append(bound[pick] if not picked else float(score_fn(state, np.array([pick]))[0]))
         state = add_fn(state, int(pick))
@@ -57,7 +60,7 @@ def _largest(values: np.ndarray) -> float:
     return float(known.max()) if len(known) else float("nan")
 
 
-def _refresh_largest(bound: np.ndarray, score_fn: Callable, batch: int) -> float:
+def _refresh_largest(bound: np.ndarray, score_fn: SourceFn, batch: int) -> float:
     """The largest score now; tightens the upper bounds [C] in place where it looked."""
     stale = ~np.isnan(bound)
     while stale.any():

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from bavs_jax.training.batches import PixelTable, training_pixels
-from bavs_jax.training.train import TrainInfo, TrainState
+from bavs_jax.pixel_table import PixelTable, training_pixels
+from bavs_jax.training.train import TrainCall, TrainInfo, TrainState
 
 CHECK_SHARE = 0.1  # of a round's steps, after which a field is looked at
 CHECK_STEPS = 256  # at least; a round of less than twice as many steps is not looked at
@@ -36,6 +36,15 @@ def is_stuck(info: TrainInfo, spread: float) -> bool:
     return bool(info.loss >= spread or info.thinned >= FULL_OF_FOG)
 
 
+class Trainer(NamedTuple):
+    """How one kind of model is trained in a round."""
+
+    init: Callable[[jax.Array], TrainState]  # has seen nothing; another one for each key
+    call: TrainCall  # from `make_train_fn`
+    num_calls: int  # compiled calls of a round
+    check_call: int | None = None  # after how many of them a stuck field starts afresh
+
+
 class Fitted(NamedTuple):
     """Where training stands after a compiled call."""
 
@@ -47,50 +56,45 @@ class Fitted(NamedTuple):
 
 def fit(
     key: jax.Array,
-    init: Callable,
-    call: Callable,
+    trainer: Trainer,
     train: TrainState,
     table: PixelTable,
     is_training_view,
     *,
-    num_calls: int,
-    check_call: int | None = None,
     calls: int = 0,
     restarts: int = 0,
     label: str = "",
 ) -> Iterator[Fitted]:
-    """Trains for `num_calls` compiled calls; yields after each one.
+    """Trains a round to its end; yields after each compiled call.
 
-    All randomness comes from `key`, `restarts` and `calls`, so training that is stopped and picked
-    up goes the same way.
+    A field that is stuck at `trainer.check_call` starts afresh with another key, at most
+    `MAX_RESTARTS` times. All randomness comes from `key`, `restarts` and `calls`, so training that
+    is stopped and picked up goes the same way.
 
     Args:
       key: of the whole training.
-      init: key -> `TrainState`, for a fresh start.
-      call: from `make_train_fn`.
+      trainer: how to train, and for how long.
       train: where it begins. It is given away: use what is yielded.
       table, is_training_view: the photos, and which are trained on.
-      num_calls: how many compiled calls there are in all.
-      check_call: after how many of them a field that is stuck starts afresh with another key, at
-        most `MAX_RESTARTS` times; None: never. See the function `check_call`.
       calls, restarts: done before.
       label: what is trained, for the error.
 
     Raises:
       FloatingPointError: the loss is not finite; nothing of that call is yielded.
     """
-    while calls < num_calls:
-        train, info = call(_call_key(key, restarts, calls), train, table, is_training_view)
+    while calls < trainer.num_calls:
+        call_key = _call_key(key, restarts, calls)
+        train, info = trainer.call(call_key, train, table, is_training_view)
         if not np.isfinite(info.loss):
             raise FloatingPointError(
                 f"{label}, training call {calls}: the loss is {float(info.loss)}; "
                 "try a smaller learning rate"
             )
         calls += 1
-        looked_at = calls == check_call and restarts < MAX_RESTARTS
+        looked_at = calls == trainer.check_call and restarts < MAX_RESTARTS
         if looked_at and is_stuck(info, colour_spread(table, is_training_view)):
             restarts += 1
-            train, calls = init(_call_key(key, restarts, num_calls)), 0
+            train, calls = trainer.init(_call_key(key, restarts, trainer.num_calls)), 0
         yield Fitted(train, calls, restarts, info)
 
 

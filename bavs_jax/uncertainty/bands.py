@@ -50,7 +50,7 @@ def has_band(quantity: str, image: dict) -> np.ndarray:
 def render_errors(
     quantity: str, image: dict, truth, known=None, *, depth_factor: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Absolute error of each pixel of a render, and where the truth is known.
+    """Absolute error [...] of each pixel of a render, and where [...] the truth is known.
 
     Args:
       quantity: "colour": the largest error over the channels, so that a band holds all three; or
@@ -59,9 +59,6 @@ def render_errors(
       truth: as "rgb", in 0 .. 1; or as "depth", scene units, 0 where unknown.
       known: [...] bool, False where the truth does not count; None where all of it does.
       depth_factor: of the rendered depth.
-
-    Returns:
-      errors [...] and bool [...].
     """
     truth = np.asarray(truth, np.float64)
     if quantity == "depth":

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from bavs_jax.fields.contraction import in_box, unit_coordinates
 from bavs_jax.fields.deformation import DeformationGrid, interpolate, offset_unit
+from bavs_jax.registry import check_known
 from bavs_jax.rendering.render import Channel
 from bavs_jax.uncertainty.posterior import (
     bayesrays_vertex_variance,
@@ -35,9 +36,8 @@ def vertex_variance(
             jac_sq_sum, num_rays=num_rays, prior_weight=prior_weight, weighting=weighting
         )
         return laplace_variance(precision).sum(-1)
-    if variant == "bayesrays":
-        return bayesrays_vertex_variance(jac_sq_sum, num_rays=num_rays, prior_weight=prior_weight)
-    raise ValueError(f"variant: {variant!r} is unknown; use one of {', '.join(VARIANTS)}")
+    check_known("variant", variant, VARIANTS)
+    return bayesrays_vertex_variance(jac_sq_sum, num_rays=num_rays, prior_weight=prior_weight)
 
 
 def uncertainty_at(
@@ -74,8 +74,7 @@ def make_uncertainty_channel(
       ValueError: unknown scale or extent.
     """
     for name, value, known in (("scale", scale, SCALES), ("extent", extent, EXTENTS)):
-        if value not in known:
-            raise ValueError(f"{name}: {value!r} is unknown; use one of {', '.join(known)}")
+        check_known(name, value, known)
     floor = 0.0 if scale == "sigma" else LOG10_MIN
 
     def value_fn(positions, directions):

@@ -9,18 +9,21 @@ Thresholds are always on the [0, 1] form of the uncertainty, `(log10 sigma + 3) 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bavs_jax.fields.base import Field
+from bavs_jax.arrays import Array
+from bavs_jax.cameras import Rays
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.metrics.covered import Sweep
+from bavs_jax.models.base import ModelState
+from bavs_jax.models.ray_field import RayField
+from bavs_jax.registry import check_known
 from bavs_jax.rendering.compositing import composite_colour, expected_depth, render_weights
-from bavs_jax.rendering.pixels import render_pixels
-from bavs_jax.rendering.samplers import Sampler
 from bavs_jax.uncertainty.channel import finish_uncertainty, make_uncertainty_channel
 
 RULES = ("quality", "keep", "knee")
@@ -28,106 +31,66 @@ RULES = ("quality", "keep", "knee")
 
 def make_point_uncertainty_fn(
     grid: DeformationGrid, variance: jax.Array, *, variant: str, extent: str = "box"
-) -> Callable:
-    """Makes the uncertainty of points that thresholds are held against.
+) -> Callable[[jax.Array], jax.Array]:
+    """Makes the uncertainty of points, in [0, 1], that thresholds are held against.
 
     Args:
       grid: the deformation grid.
       variance: [G] from `vertex_variance`.
       variant, extent: see `make_uncertainty_channel`; with the extent `box`, what lies outside of
         the scene box is never removed.
-
-    Returns:
-      `uncertainty(positions [..., 3]) -> [...]` in [0, 1].
     """
     channel = make_uncertainty_channel(grid, variance, variant=variant, scale="log", extent=extent)
 
     def uncertainty(positions):
-        return finish_uncertainty(channel.value_fn(positions, None), scale="log")
+        # The same from wherever it is looked at: the directions are not read.
+        return finish_uncertainty(channel.value_fn(positions, positions), scale="log")
 
     return uncertainty
 
 
-def clean_field(field: Field, uncertainty_fn: Callable, threshold) -> Field:
-    """The field without the density of uncertain points: `sigma(x) [u(x) <= threshold]`.
-
-    It goes wherever a field goes: into the renderer, into curvature, into an export.
-
-    Args:
-      field: the trained field.
-      uncertainty_fn: positions [K, 3] -> [K], from `make_point_uncertainty_fn`.
-      threshold: [] in the unit of the uncertainty; may be traced.
-    """
-
-    def kept(positions, density):
-        return jnp.where(uncertainty_fn(positions) > threshold, 0.0, density)
-
-    def apply(params, positions, directions, **inputs):
-        density, *rest = field.apply(params, positions, directions, **inputs)
-        return kept(positions, density), *rest
-
-    def density(params, positions, **inputs):
-        return kept(positions, field.density(params, positions, **inputs))
-
-    return field._replace(apply=apply, density=density)
-
-
 def make_cleaned_render_fn(
-    field: Field,
-    sampler: Sampler,
-    grid: DeformationGrid,
-    *,
-    background,
-    capacity: int,
-    variant: str,
-    extent: str = "box",
-) -> Callable:
-    """Makes the compiled rendering of `clean_field` for many thresholds at once.
+    model: RayField, grid: DeformationGrid, *, variant: str, extent: str = "box"
+) -> Callable[[ModelState, Array, Array, Rays], dict[str, jax.Array]]:
+    """Makes the compiled rendering of the cleaned field for many thresholds at once.
 
-    To remove a point changes nothing of what the field says elsewhere, so that one evaluation of
-    all samples serves every threshold; only the compositing (Eqs 2-3) is done for each. Thresholds
-    are traced: a sweep compiles once for each number of them.
+    The cleaned field is `sigma(x) [u(x) <= threshold]`. To remove a point changes nothing of what
+    the field says elsewhere, so that one evaluation of all samples serves every threshold; only the
+    compositing (Eqs 2-3) is done for each. Thresholds are traced: a sweep compiles once for each
+    number of them.
 
     Samples lie where the sampler of the *untouched* field puts them. Steps through an occupancy
     grid are even, so nothing is lost; samplers that gather samples at the first surface leave few
     for what lies behind a removed floater.
 
     Args:
-      field, sampler, grid: as trained, and the deformation grid.
-      background, capacity: see `render_rays`.
+      model, grid: the field and the deformation grid.
       variant, extent: see `make_point_uncertainty_fn`.
 
     Returns:
-      `render(params, sampler_state, variance [G], thresholds [T], rays [R])`, a dict of "rgb"
-      [R, T, 3], "depth" [R, T] (scene units), "opacity" [R, T], and "content" [R, T]: the rendering
-      weight of the untouched field that its samples up to the threshold hold,
-      `sum_i w_i [u_i <= threshold]`.
+      `render(state, variance [G], thresholds [T], rays)`, which gives of R rays "rgb" [R, T, 3],
+      "depth" [R, T] (scene units), "opacity" [R, T], and "content" [R, T]: the rendering weight of
+      the untouched field that its samples up to the threshold hold, `sum_i w_i [u_i <= threshold]`.
     """
 
     @jax.jit
-    def render(params, sampler_state, variance, thresholds, rays):
+    def render(state, variance, thresholds, rays):
         uncertainty_fn = make_point_uncertainty_fn(grid, variance, variant=variant, extent=extent)
 
         def apply_and_keep(field_params, positions, directions, **inputs):
-            density, rgb, *_ = field.apply(field_params, positions, directions, **inputs)
+            density, rgb, *_ = model.field.apply(field_params, positions, directions, **inputs)
             return density, rgb, {"rgb": rgb, "uncertainty": uncertainty_fn(positions)}
 
-        untouched, samples = render_pixels(
-            field._replace(apply=apply_and_keep),
-            sampler,
-            params,
-            sampler_state,
-            rays,
-            background=background,
-            capacity=capacity,
-        )
+        keeping = dataclasses.replace(model, field=model.field._replace(apply=apply_and_keep))
+        untouched = keeping.render(state, rays)
+        samples = untouched.samples
         rgb, uncertainty = untouched.values["rgb"], untouched.values["uncertainty"]
 
         def composited(threshold):
             removed = uncertainty > threshold
             weights = render_weights(jnp.where(removed, 0.0, untouched.density), samples.deltas)
             return {
-                "rgb": composite_colour(weights, rgb, background),
+                "rgb": composite_colour(weights, rgb, model.background),
                 "depth": expected_depth(weights, samples.t_mids),
                 "opacity": weights.sum(-1),
                 "content": jnp.where(removed, 0.0, untouched.weights).sum(-1),
@@ -141,15 +104,12 @@ def make_cleaned_render_fn(
 
 
 def spread_thresholds(variance, num: int, unit) -> np.ndarray:
-    """Thresholds from the most certain vertex to the least certain one, and `+inf` at the end.
+    """Thresholds [num + 1] from the most certain vertex to the least certain one, then `+inf`.
 
     Args:
       variance: [G] from `vertex_variance`, scene unit^2, > 0.
       num: how many below `+inf`, evenly spaced in the [0, 1] form.
       unit: `offset_unit` of the scene's box.
-
-    Returns:
-      [num + 1] ascending.
     """
     ends = jnp.array([jnp.min(variance), jnp.max(variance)])
     low, high = finish_uncertainty(0.5 * jnp.log10(ends) - jnp.log10(unit), scale="log")
@@ -187,8 +147,7 @@ def choose_threshold(
       ValueError: unknown rule, a loss below 0, a share outside of (0, 1], or fewer than 3 finite
         thresholds for the rule `knee`.
     """
-    if rule not in RULES:
-        raise ValueError(f"rule: {rule!r} is unknown; use one of {', '.join(RULES)}")
+    check_known("rule", rule, RULES)
     if not max_loss >= 0.0:
         raise ValueError(f"max_loss: {max_loss} is no loss; give 0 dB or more")
     if not 0.0 < keep <= 1.0:

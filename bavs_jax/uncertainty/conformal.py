@@ -78,18 +78,18 @@ def calibrate(
       ValueError: a group or a view is empty, a value is negative or not finite, a level is outside
         (0, 1), or the scale is unknown.
     """
-    levels = np.unique(np.asarray(levels, np.float64))
-    if levels.size == 0 or not ((levels > 0.0) & (levels < 1.0)).all():
-        raise ValueError(f"levels {levels.tolist()}: give at least one, each in (0, 1)")
+    shares = np.unique(np.asarray(levels, np.float64))
+    if shares.size == 0 or not ((shares > 0.0) & (shares < 1.0)).all():
+        raise ValueError(f"levels {shares.tolist()}: give at least one, each in (0, 1)")
     fitted = fit_scale(fit, scale=scale)
     errors, uncertainty, weights = pool_views(calibration, group="calibration")
     num_views = len(calibration)
     weights *= num_views / (num_views + 1.0)  # the rest is the new view's, at infinity
     return Calibrated(
-        levels,
-        weighted_quantile(errors / evaluate_scale(fitted, uncertainty), weights, levels),
+        shares,
+        weighted_quantile(errors / evaluate_scale(fitted, uncertainty), weights, shares),
         fitted,
-        weighted_quantile(errors, weights, levels),
+        weighted_quantile(errors, weights, shares),
         num_views,
     )
 
@@ -125,7 +125,7 @@ def interval(
     *,
     bounds: tuple[float, float] = (-np.inf, np.inf),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper end of the interval around a prediction.
+    """Lower and upper end of the interval around a prediction, both of its shape.
 
     Args:
       calibrated: of `calibrate`.
@@ -135,9 +135,6 @@ def interval(
       level: one of `calibrated.levels`.
       bounds: what the truth is known to lie in, (0, 1) for colours and (0, inf) for depth; the
         interval is cut to it, which costs no coverage.
-
-    Returns:
-      two arrays of the shape of `prediction`.
 
     Raises:
       ValueError: as `half_width`, or the shapes do not fit.

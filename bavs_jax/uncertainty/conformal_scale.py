@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import isotonic_regression
 
+from bavs_jax.registry import check_known
+
 SHARES = (0.25, 0.5, 0.25)  # calibration needs the most: V views promise V / (V + 1) at best
 
 
@@ -22,7 +24,7 @@ class ViewGroups(NamedTuple):
 def split_views(
     views: Sequence[int], *, seed: int | None, shares: Sequence[float] = SHARES
 ) -> ViewGroups:
-    """Splits views, never pixels, into fit, calibration and test.
+    """Splits views, never pixels, into fit, calibration and test, within one view of the shares.
 
     Args:
       views: numbers of views that were not trained on, each once.
@@ -31,30 +33,29 @@ def split_views(
         guarantee is for the random split; the interleaved one has no luck of the draw.
       shares: of fit, calibration and test, > 0, whose sum is 1.
 
-    Returns:
-      the groups, each within one view of its share.
-
     Raises:
       ValueError: views come twice, shares are not such, or a group would be empty.
     """
-    views, shares = np.asarray(views, np.int64), np.asarray(shares, np.float64)
-    if shares.shape != (3,) or not (shares > 0.0).all() or abs(shares.sum() - 1.0) > 1e-6:
+    numbers, wanted = np.asarray(views, np.int64), np.asarray(shares, np.float64)
+    if wanted.shape != (3,) or not (wanted > 0.0).all() or abs(wanted.sum() - 1.0) > 1e-6:
         raise ValueError(
-            f"shares {shares.tolist()}: give three of fit, calibration and test, each > 0, sum 1"
+            f"shares {wanted.tolist()}: give three of fit, calibration and test, each > 0, sum 1"
         )
-    if views.ndim != 1 or len(np.unique(views)) != len(views):
+    if numbers.ndim != 1 or len(np.unique(numbers)) != len(numbers):
         raise ValueError("views: give a list of numbers, each view once")
-    order = views if seed is None else np.random.default_rng(seed).permutation(np.sort(views))
+    order = numbers
+    if seed is not None:
+        order = np.random.default_rng(seed).permutation(np.sort(numbers))
     counts = np.zeros(3, int)
-    group = np.zeros(len(views), int)
-    for row in range(len(views)):
+    group = np.zeros(len(numbers), int)
+    for row in range(len(numbers)):
         # The group that is furthest behind its share; rounded, for ties to go to the first.
-        group[row] = np.argmax(np.round(shares * (row + 1) - counts, 9))
+        group[row] = np.argmax(np.round(wanted * (row + 1) - counts, 9))
         counts[group[row]] += 1
     if not counts.all():
         raise ValueError(
-            f"views: {len(views)} are too few for fit, calibration and test with shares "
-            f"{shares.tolist()}: they would get {counts.tolist()}; give more views"
+            f"views: {len(numbers)} are too few for fit, calibration and test with shares "
+            f"{wanted.tolist()}: they would get {counts.tolist()}; give more views"
         )
     return ViewGroups(*(np.sort(order[group == which]) for which in range(3)))
 
@@ -101,8 +102,7 @@ def fit_scale(views: Sequence[ViewErrors], *, scale: str) -> Scale:
     Numerics: the floor keeps |error| / scale finite. It is 1 where all that it is relative to
     is 0: then the scale is constant.
     """
-    if scale not in SCALES:
-        raise ValueError(f"scale: {scale!r} is unknown; use one of {', '.join(SCALES)}")
+    check_known("scale", scale, SCALES)
     errors, uncertainty, weights = pool_views(views, group="fit")
     if scale == "uncertainty":
         knots, values, typical = np.zeros(0), np.zeros(0), weights @ uncertainty
@@ -129,15 +129,12 @@ def evaluate_scale(scale: Scale, uncertainty) -> np.ndarray:
 
 
 def weighted_quantile(values, weights, levels) -> np.ndarray:
-    """The smallest value up to which the weights sum to a level, infinite if they never do.
+    """The smallest value up to which the weights sum to a level, [L]; infinite if they never do.
 
     Args:
       values: [N] in any order.
       weights: [N] > 0, whose sum is at most 1; what is missing to 1 sits at infinity.
       levels: [L] in (0, 1).
-
-    Returns:
-      [L].
 
     Numerics: a sum short of a level by less than `ROUNDING` counts as reaching it.
     """
@@ -146,7 +143,9 @@ def weighted_quantile(values, weights, levels) -> np.ndarray:
     return np.append(values[order], np.inf)[reached]
 
 
-def pool_views(views: Sequence[ViewErrors], *, group: str) -> tuple:
+def pool_views(
+    views: Sequence[ViewErrors], *, group: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Errors, uncertainty and weight of all pixels of V views, [N] each, checked, float64.
 
     A pixel weighs `1 / (V n)` in a view of n pixels: views count the same, whatever their size.

@@ -8,10 +8,11 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from bavs_jax.fields.base import Field
+from bavs_jax.arrays import Array
+from bavs_jax.cameras import Rays
 from bavs_jax.fields.deformation import DeformationGrid, displace
-from bavs_jax.rendering.pixels import basic_images, render_pixels
-from bavs_jax.rendering.samplers import Sampler
+from bavs_jax.models.base import ModelState, RadianceModel
+from bavs_jax.rendering.render import basic_images
 
 
 def draw_offsets(key, precision: jax.Array, num: int, *, scale=1.0, limit=jnp.inf) -> jax.Array:
@@ -52,46 +53,31 @@ def noise_scale(mse, num_rays) -> jax.Array:
 
 
 def make_displaced_render_fn(
-    field: Field, sampler: Sampler, grid: DeformationGrid, *, background, capacity: int
-) -> Callable:
-    """Makes the compiled rendering of the field read at `x + D_theta(x)`.
+    model: RadianceModel, grid: DeformationGrid
+) -> Callable[[ModelState, Array, Rays], dict[str, jax.Array]]:
+    """Makes the compiled rendering of a model read at `x + D_theta(x)`.
 
     Samples lie where they lie for `theta = 0`, as they do for the curvature: what moves is where
     the field is read.
 
-    Args:
-      field, sampler, grid: as trained, and the deformation grid.
-      background, capacity: see `render_rays`.
-
     Returns:
-      `render(params, sampler_state, offsets [G, 3], rays [R]) -> {"rgb" [R, 3], "depth" [R],
-      "opacity" [R], "thinned" [R]}`. Offsets are traced: no draw compiles anew.
+      `render(state, offsets [G, 3], rays)`, which gives the `basic_images` of R rays. Offsets are
+      traced: no draw compiles anew.
     """
 
     @jax.jit
-    def render(params, sampler_state, offsets, rays):
-        rendering, samples = render_pixels(
-            field,
-            sampler,
-            params,
-            sampler_state,
-            rays,
-            background=background,
-            capacity=capacity,
-            displace_fn=partial(displace, grid, offsets),
-        )
-        return basic_images(rendering, samples)
+    def render(state, offsets, rays):
+        return basic_images(model.render(state, rays, displace_fn=partial(displace, grid, offsets)))
 
     return render
 
 
 def colour_spread(rgb: jax.Array) -> jax.Array:
-    """How far a pixel's colour moves over draws: `sqrt(mean_c var_d C_dc)`, in [0, 1].
+    """How far a pixel's colour moves over draws: `sqrt(mean_c var_d C_dc)`, [...] in [0, 1].
+
+    The variance is the unbiased one.
 
     Args:
       rgb: [D, ..., 3] of D >= 2 draws, sRGB in [0, 1].
-
-    Returns:
-      [...]; the variance is the unbiased one.
     """
     return jnp.sqrt(jnp.var(rgb, axis=0, ddof=1).mean(-1))

@@ -2,52 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+import jax
 import numpy as np
 
-from bavs_jax.cameras import take
+from bavs_jax.arrays import Array
+from bavs_jax.cameras import Cameras, Rays, reduced_cameras, take
 from bavs_jax.devices import jit_over_rays
-from bavs_jax.rendering.images import render_views
-from bavs_jax.rendering.pixels import basic_images, render_pixels
+from bavs_jax.rendering.images import RenderChunk, render_views
+from bavs_jax.rendering.render import RayRendering, basic_images
+from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import Toolbox
-from bavs_jax.uncertainty.scoring import reduced_cameras
 
 
-def make_image_fn(toolbox: Toolbox, kind: str, measures_fn: Callable | None = None) -> Callable:
-    """Makes the compiled `images(train_state, rays [R]) -> dict` of a kind of field.
+def make_image_fn(
+    toolbox: Toolbox,
+    kind: str,
+    measures_fn: Callable[[RayRendering], dict[str, jax.Array]] | None = None,
+) -> Callable[[TrainState, Rays], dict[str, jax.Array]]:
+    """Makes the compiled renders of a kind of field, `basic_images` and further measures.
 
     Args:
       toolbox: the parts of a scene.
-      kind: a key of `toolbox.fields`.
-      measures_fn: `Rendering` of R rays -> dict of [R], beside `basic_images`.
+      kind: a key of `toolbox.models`.
+      measures_fn: the further measures, [R] each; they need a field that is sampled along rays.
     """
-    field, sampler = toolbox.fields[kind]
+    model = toolbox.models[kind]
 
-    def images(params, sampler_state, rays):
-        rendering, samples = render_pixels(
-            field,
-            sampler,
-            params,
-            sampler_state,
-            rays,
-            background=toolbox.background,
-            capacity=toolbox.capacity,
-        )
-        more = {} if measures_fn is None else measures_fn(rendering)
-        return {**basic_images(rendering, samples), **more}
+    def images(state, rays):
+        rendering = model.render(state, rays)
+        images = basic_images(rendering)
+        if measures_fn is None:
+            return images
+        if not isinstance(rendering, RayRendering):
+            raise TypeError(f"{kind}: has no samples along its rays, which the measures are of")
+        return {**images, **measures_fn(rendering)}
 
-    compiled = jit_over_rays(images, toolbox.mesh, spread=(False, False, True))
-    return lambda train, rays: compiled(train.params, train.sampler_state, rays)
+    compiled = jit_over_rays(images, toolbox.mesh, spread=(False, True))
+    return lambda train, rays: compiled(train.model, rays)
 
 
 def render_stack(
-    image_fn: Callable, cameras, mask, *, scale: float, chunk: int, names=("rgb", "depth")
+    image_fn: RenderChunk,
+    cameras: Cameras,
+    mask: Array,
+    *,
+    scale: float,
+    chunk: int,
+    names: Sequence[str] = ("rgb", "depth"),
 ) -> tuple:
     """Renders the marked views at a reduced size into arrays over all of them, 0 elsewhere.
 
     Args:
-      image_fn: rays [chunk] -> dict.
+      image_fn: renders `chunk` rays.
       cameras: [V].
       mask: [V] bool, which to render.
       scale: of width and height.

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from bavs_jax.cameras import Cameras, take
+from bavs_jax.arrays import Array
+from bavs_jax.cameras import Cameras, project, reduced_cameras, take
 from bavs_jax.numerics import opacity_or_empty, safe_divide, x_log_x
-from bavs_jax.projection import project
-from bavs_jax.rendering.images import render_views
+from bavs_jax.rendering.images import RenderChunk, render_views
 from bavs_jax.scenes.base import Scene
-from bavs_jax.uncertainty.scoring import reduced_cameras
+from bavs_jax.training.train import TrainState
 
 
 def ray_entropy(weights: jax.Array, *, by_opacity: bool = True) -> jax.Array:
@@ -52,7 +52,7 @@ def colour_variance(rgb: jax.Array) -> jax.Array:
 
 
 def missing_density(opacity: jax.Array, *, known_background: bool = True) -> jax.Array:
-    """What the members do not know for lack of any surface, `(1 - mean_k o_k)^2`.
+    """What the members do not know for lack of any surface, `(1 - mean_k o_k)^2`, [...].
 
     The authors' term says that every ray should end somewhere, and where none does the field was
     never told what is there. That holds in rooms and landscapes. In front of a known background
@@ -63,9 +63,6 @@ def missing_density(opacity: jax.Array, *, known_background: bool = True) -> jax
     Args:
       opacity: [E, ...] of the same rays in each field, in [0, 1].
       known_background: False for the published form, which is 1 on a ray that meets nothing.
-
-    Returns:
-      [...] in [0, 1].
     """
     missing = (1.0 - opacity.mean(axis=0)) ** 2
     return opacity.max(axis=0) * missing if known_background else missing
@@ -128,7 +125,7 @@ def variance_reduction(
 DEFAULT_TOLERANCE = 0.05
 
 
-def at_nearest_pixel(image: jax.Array, pixels: jax.Array) -> jax.Array:
+def at_nearest_pixel(image: Array, pixels: jax.Array) -> jax.Array:
     """Values of an image [H, W] at pixels [..., 2] without blending: [...].
 
     For depth, where a blend of two surfaces lies on neither. Pixels outside get the edge's value.
@@ -140,8 +137,8 @@ def at_nearest_pixel(image: jax.Array, pixels: jax.Array) -> jax.Array:
 
 def look_at_points(
     camera: Cameras,
-    points: jax.Array,
-    depth_map: jax.Array | None = None,
+    points: Array,
+    depth_map: Array | None = None,
     *,
     tolerance: float = DEFAULT_TOLERANCE,
 ) -> tuple[jax.Array, jax.Array]:
@@ -176,7 +173,7 @@ def direction_novelty(
     *,
     tolerance: float = DEFAULT_TOLERANCE,
 ) -> jax.Array:
-    """How differently points are looked at than from any camera that sees them.
+    """How differently points are looked at than from any camera that sees them, [K] in [0, 1].
 
     `1 - (1 + max_c d_c . d) / 2`, the squared sine of half the angle to the nearest direction
     from which the point is seen: 0 if it is seen from just there, 1/2 at a right angle, 1 from the
@@ -191,9 +188,6 @@ def direction_novelty(
       depth_maps: [V, H, W] rendered distances along the rays of `cameras`, whose images must be of
         that size, 0 where empty; with them a camera does not see what is hidden from it.
       tolerance: see `look_at_points`.
-
-    Returns:
-      [K] in [0, 1].
 
     Numerics: computed as `min_c |d - d_c|^2 / 4`, exact for near directions.
     """
@@ -217,19 +211,20 @@ def direction_novelty(
     return novelty
 
 
+# From a state of training and view ids [n], the mean squared errors [n] of renders of these views.
+TrueErrorFn = Callable[[TrainState, np.ndarray], np.ndarray]
+
+
 def make_true_error_fn(
-    render_fn: Callable, scene: Scene, *, image_scale: float, chunk: int
-) -> Callable:
+    render_fn: Callable[[TrainState], RenderChunk], scene: Scene, *, image_scale: float, chunk: int
+) -> TrueErrorFn:
     """Makes the mean squared colour error of renders against the photos themselves.
 
     Args:
-      render_fn: state -> (`Rays` [chunk] -> dict with "rgb").
+      render_fn: from a state of training, what renders "rgb" of `chunk` rays.
       scene: the scene with its photos.
       image_scale: of width and height; photos are reduced by the mean over areas.
       chunk: rays of one compiled call.
-
-    Returns:
-      `true_error(state, view_ids [n]) -> [n]`, colours in [0, 1].
     """
 
     def true_error(state, view_ids):

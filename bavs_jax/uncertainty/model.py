@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
 
 import jax
 from jax.sharding import Mesh
 
-from bavs_jax.cameras import Cameras
-from bavs_jax.fields.base import Field
+from bavs_jax.arrays import Array
+from bavs_jax.cameras import Cameras, Rays
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.fields.flow_field import FlowField
-from bavs_jax.rendering.samplers import Sampler
-from bavs_jax.training.batches import PixelTable
+from bavs_jax.models.base import RadianceModel
+from bavs_jax.pixel_table import PixelTable
 from bavs_jax.training.train import TrainState
+from bavs_jax.uncertainty.streaming import CurvatureOfRays
+
+Fitted = Any  # a pytree, each model's own
 
 # Kinds of fields.
 RECONSTRUCTION = "reconstruction"
@@ -22,34 +25,50 @@ VARIANCE = "variance"  # with a learned variance of each point's colour
 FLOW = "flow"  # the mean of a distribution over fields
 
 
+class MakeFns(Protocol):
+    """Makes a model for one scene; called once for each, it compiles what it needs."""
+
+    def __call__(self, toolbox: Toolbox, /) -> ModelFns: ...
+
+
 class UncertaintyModel(NamedTuple):
     """One way to say how uncertain each pixel is.
 
-    `make_fns(toolbox) -> ModelFns` is called once for each scene and compiles what it needs. A
-    ray that meets nothing has an uncertainty of 0 in every model: the background of a scene whose
+    A ray that meets nothing has an uncertainty of 0 in every model: the background of a scene whose
     background is known must not decide.
     """
 
     name: str  # by which a config names it
     summary: str  # one sentence
-    make_fns: Callable[[Toolbox], ModelFns]
+    make_fns: MakeFns
     trains: tuple[str, ...] = ()  # kinds of fields that it trains beside the reconstruction
 
 
+class Fit(Protocol):
+    """All that must be computed before the first pixel, from what is known."""
+
+    def __call__(self, key: jax.Array, situation: Situation, /) -> Fitted: ...
+
+
+class RenderFitted(Protocol):
+    """Images of R rays, [R, ...] each: "rgb", "depth", "opacity", "thinned" and "uncertainty" >= 0;
+    and by the names that policies ask for, further measures that are made on the way."""
+
+    def __call__(self, fitted: Fitted, train: TrainState, rays: Rays, /) -> Mapping[str, Array]: ...
+
+
+class Condition(Protocol):
+    """What is still unknown once the candidates marked in `picked` [C] are photographed."""
+
+    def __call__(self, fitted: Fitted, train: TrainState, picked: Array, /) -> Fitted: ...
+
+
 class ModelFns(NamedTuple):
-    """A model for one scene.
+    """A model for one scene."""
 
-    `fit(key, situation) -> fitted`: all that must be computed before the first pixel; a pytree.
-    `render(fitted, train_state, rays [R]) -> images`: a dict of [R, ...] with "rgb", "depth",
-      "opacity", "thinned" and "uncertainty" >= 0; and by the names that policies ask for, further
-      measures that are made on the way.
-    `condition(fitted, train_state, picked [C]) -> fitted`: what is still unknown once the
-      candidates that are marked are photographed too; None where a model needs the photo for that.
-    """
-
-    fit: Callable[..., Any]
-    render: Callable[..., dict[str, jax.Array]]
-    condition: Callable[..., Any] | None = None
+    fit: Fit
+    render: RenderFitted
+    condition: Condition | None = None  # None where a model needs the photo for that
 
 
 class LaplaceOptions(NamedTuple):
@@ -65,31 +84,26 @@ class LaplaceOptions(NamedTuple):
 
 
 class Toolbox(NamedTuple):
-    """What a model may use for one scene.
+    """What an uncertainty model may use for one scene."""
 
-    `curvature(train_state, rays [N], label, *, weighting, targets=None, view_ids=None,
-      ray_weight=None, group_ids=None) -> [G, 3]`, the `jac_sq_sum` (see `make_curvature_fn`); with
-      `group_ids` [N] that of each of `group_size` groups of rays, [group_size, G, 3]. Shows
-      progress where `label` is not None.
-    `train(kind, key, situation) -> TrainState` trains a field of any kind, from a start of its own,
-      on the views of the situation.
-    """
-
-    fields: dict[str, tuple[Field, Sampler]]  # by kind
+    models: dict[str, RadianceModel]  # by kind
     flow: FlowField  # the distribution whose mean is the field of kind FLOW
     kind: str  # of the field that is trained and measured in this run
-    background: Any  # [3], or None (see `composite_colour`)
-    capacity: int  # places of each device's buffer in which samples are evaluated when rendering
     grid: DeformationGrid
     laplace: LaplaceOptions
-    group_size: int  # views whose curvatures are made at once, each a dense [G, 3]
-    curvature: Callable
-    train: Callable
+    curvature: CurvatureOfRays  # of the model of this kind
+    # Trains a field of any kind, from a start of its own, on the views of a situation.
+    train: Callable[[str, jax.Array, Situation], TrainState]
     image_scale: float = 0.25  # of width and height, for renders of whole views
     chunk: int = 4096  # rays of one compiled call
     ensemble_size: int = 3  # fields, the run's own among them
     num_draws: int = 32  # of the distribution over fields
     mesh: Mesh | None = None  # devices that share the rays (see `devices.py`)
+
+    @property
+    def model(self) -> RadianceModel:
+        """The model that is trained and measured in this run."""
+        return self.models[self.kind]
 
 
 class Situation(NamedTuple):
@@ -97,7 +111,7 @@ class Situation(NamedTuple):
 
     train: TrainState
     table: PixelTable
-    is_training_view: Any  # [V] bool
+    is_training_view: Array  # [V] bool
     num_rays: int  # R of Eq 13: the training rays of round 0, fixed for the run
     candidates: Cameras | None = None  # [C]
     label: str = ""  # for progress

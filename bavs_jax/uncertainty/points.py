@@ -2,22 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Protocol
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from bavs_jax.fields.base import Field
+from bavs_jax.arrays import Array
 from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.models.base import ModelState, RadianceModel
+from bavs_jax.progress import Progress, map_chunks
+from bavs_jax.registry import check_known
 from bavs_jax.uncertainty.channel import VARIANTS, uncertainty_at
 
 CHUNK = 1 << 15  # points of one compiled call
 
 
+class PointFn(Protocol):
+    """See `make_point_fn`."""
+
+    def __call__(
+        self,
+        state: ModelState,
+        variance: Array,
+        positions: Array,
+        /,
+        *,
+        directions: Array | None = None,
+        progress_fn: Progress | None = None,
+    ) -> dict[str, np.ndarray]: ...
+
+
 def make_point_fn(
-    field: Field, grid: DeformationGrid, *, variant: str, chunk: int = CHUNK
-) -> Callable:
+    model: RadianceModel, grid: DeformationGrid, *, variant: str, chunk: int = CHUNK
+) -> PointFn:
     """Makes the query of a trained field and its Laplace posterior at single points.
 
     What the renderer composites along a ray is here read at the points themselves: density and
@@ -26,67 +43,54 @@ def make_point_fn(
     piece of a pixel's cone, the mean code in place of a view's.
 
     Args:
-      field: the radiance field.
+      model: the radiance model.
       grid: the deformation grid.
       variant: one of `channel.VARIANTS`.
       chunk: points of one compiled call.
 
     Returns:
-      `point_fn(params, variance [G], positions [K, 3], *, directions=None, progress_fn=None)`, with
-      the field's own parameters, the variances of `vertex_variance` and any K, gives a dict of host
-      arrays, float32:
-        "density" [K] 1 / scene unit; 0 outside of the box of a bounded scene, where the renderer
-          never looks;
-        "sigma" [K] standard deviation of the offset, scene units; outside of the box of a bounded
-          scene that of the nearest face;
-        "rgb" [K, 3] in [0, 1], only with `directions`: unit vectors along which points are looked
-          at, [3] for all points, [K, 3] one for each, or [D, 1 or K, 3] for the mean over D.
-      `progress_fn(n)` is called with the number of points done.
+      `point_fn(state, variance [G], positions [K, 3])` of any K points in scene units, which gives
+      as host arrays, float32:
+      "density" [K] 1 / scene unit; 0 outside of the box of a bounded scene, where the renderer
+        never looks;
+      "sigma" [K] standard deviation of the offset, scene units; outside of the box of a bounded
+        scene that of the nearest face;
+      "rgb" [K, 3] in [0, 1], only with `directions`: unit vectors along which points are looked
+        at, [3] for all points, [K, 3] one for each, or [D, 1 or K, 3] for the mean over D.
 
     Raises:
-      ValueError: unknown variant; by `point_fn`: positions or directions of the wrong shape.
+      ValueError: unknown variant; from `point_fn`, positions or directions of the wrong shape.
     """
-    if variant not in VARIANTS:
-        raise ValueError(f"variant: {variant!r} is unknown; use one of {', '.join(VARIANTS)}")
+    check_known("variant", variant, VARIANTS)
 
     @jax.jit
-    def query(params, variance, positions, directions):
-        density = field.density(params, positions)
-        if not grid.contracted:
-            lower, upper = grid.box
-            inside = ((positions >= lower) & (positions <= upper)).all(-1)
-            density = jnp.where(inside, density, 0.0)
+    def query(state, variance, positions, directions):
         values = {
-            "density": density,
+            "density": model.density(state, positions),
             "sigma": uncertainty_at(grid, variance, positions, variant=variant),
         }
         if directions is not None:
             # Mapped over directions alone, the part of the field before them is evaluated once.
-            colours = jax.vmap(lambda d: field.apply(params, positions, d)[1])(directions)
+            colours = jax.vmap(lambda d: model.radiance(state, positions, d)[1])(directions)
             values["rgb"] = colours.mean(0)
         return values
 
-    def point_fn(params, variance, positions, *, directions=None, progress_fn=None):
+    def point_fn(state, variance, positions, *, directions=None, progress_fn=None):
         positions = np.asarray(positions, np.float32)
         if positions.ndim != 2 or positions.shape[1] != 3:
             raise ValueError(f"positions: have the shape {positions.shape}; give [K, 3]")
         num = len(positions)
-        if directions is not None:
-            directions = _stacked(directions, num)
-        parts = []
-        for start in range(0, max(num, 1), chunk):
-            # An empty list is one chunk of nothing, so that its answer has the right shapes.
-            rows = np.minimum(np.arange(start, start + chunk), max(num - 1, 0))
-            points = positions[rows] if num else np.zeros((chunk, 3), np.float32)
-            looks = directions
-            if looks is not None:
-                looks = looks[:, rows] if num else np.zeros((len(looks), chunk, 3), np.float32)
-            count = min(chunk, num - start)
-            values = query(params, variance, points, looks)
-            parts.append({name: np.asarray(x)[:count] for name, x in values.items()})
-            if progress_fn is not None:
-                progress_fn(count)
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        looks = None if directions is None else _stacked(directions, num)
+        if not num:  # one point that is left out again, so that the answer has the right shapes
+            positions, progress_fn = np.zeros((1, 3), np.float32), None
+            looks = None if looks is None else np.zeros((len(looks), 1, 3), np.float32)
+
+        def read(rows):
+            some = None if looks is None else looks[:, rows]
+            return query(state, variance, positions[rows], some)
+
+        found = map_chunks(read, len(positions), chunk, progress_fn)
+        return {name: x[:num] for name, x in found.items()}
 
     return point_fn
 

@@ -19,12 +19,22 @@ def default_prior_weight(log2_cells: int) -> float:
     return 1e-4 / (2**log2_cells) ** 3
 
 
+def curvature_factor(num_rays, weighting: str = "eq13"):
+    """`f / R`, by which the raw sum over rays enters the precision (Eq 13)."""
+    return _FACTORS[weighting] / num_rays
+
+
+def prior_precision(prior_weight):
+    """`2 lambda`, the precision where no ray has looked, 1 / scene unit^2."""
+    return 2.0 * prior_weight
+
+
 def posterior_precision(
     jac_sq_sum: jax.Array, *, num_rays, prior_weight, weighting: str = "eq13"
 ) -> jax.Array:
     """Curvature of the negative log posterior, `H = (f / R) jac_sq_sum + 2 lambda` (Eq 13).
 
-    `f` is 2 for `eq13` and 4 for `eq11` and `empirical`.
+    H is in 1 / scene unit^2; `f` is 2 for `eq13` and 4 for `eq11` and `empirical`.
 
     Args:
       jac_sq_sum: [G, 3] raw sum over rays, >= 0.
@@ -33,12 +43,9 @@ def posterior_precision(
       prior_weight: lambda > 0, 1 / scene unit^2.
       weighting: how `jac_sq_sum` was weighted.
 
-    Returns:
-      [G, 3] > 0, 1 / scene unit^2.
-
     Differs from the paper: Eqs 6, 9, 10 and 13 carry sign slips; H here is positive.
     """
-    return (_FACTORS[weighting] / num_rays) * jac_sq_sum + 2.0 * prior_weight
+    return curvature_factor(num_rays, weighting) * jac_sq_sum + prior_precision(prior_weight)
 
 
 def laplace_variance(precision: jax.Array) -> jax.Array:

@@ -20,44 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
+from bavs_jax.arrays import Array
 from bavs_jax.cameras import Rays
 from bavs_jax.devices import jit_over_rays, num_shards
-from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.models.base import ModelState, RadianceModel
 from bavs_jax.numerics import computed_once
-from bavs_jax.rendering.compositing import expected_depth, render_weights
-from bavs_jax.rendering.samplers import Sampler
-from bavs_jax.rendering.sampling import Samples, first_slots, sample_positions
-from bavs_jax.uncertainty.curvature import (
-    FieldSlopes,
-    composited_jacobian,
-    field_slopes,
-    vertex_squares,
-)
+from bavs_jax.uncertainty.curvature import vertex_squares
 from bavs_jax.uncertainty.streaming import bucket_sizes, bucketed_rows
-
-
-def depth_jacobian(slopes: FieldSlopes, samples: Samples) -> tuple[jax.Array, jax.Array]:
-    """Derivative of each ray's expected depth by an offset of each of its samples.
-
-    `dD_r / dx_id = dD_r / dsigma_i dsigma_i / dx_id`. Sample positions are held fixed.
-
-    Args:
-      slopes: from `field_slopes`.
-      samples: [R, S].
-
-    Returns:
-      jacobian [R, 1, S, 3], without unit, and the depths [R], scene units.
-    """
-
-    def ray_depth(density, deltas, t_mids):
-        depth = expected_depth(render_weights(density, deltas), t_mids)
-        return depth, depth
-
-    by_density, depth = jax.vmap(jax.grad(ray_depth, has_aux=True))(
-        slopes.density, samples.deltas, samples.t_mids
-    )
-    return (by_density[..., None] * slopes.density_slope)[:, None], depth
 
 
 def predictive_variance(
@@ -83,69 +53,60 @@ def predictive_variance(
 
 
 def make_predictive_fn(
-    field: Field,
-    sampler: Sampler,
+    model: RadianceModel,
     grid: DeformationGrid,
     *,
-    background,
     chunk_samples: int = 8192,
     mesh: Mesh | None = None,
-) -> Callable:
-    """Makes `render(params, sampler_state, variance [G, 3], rays [R]) -> images`.
+) -> Callable[[ModelState, Array, Rays], dict[str, np.ndarray]]:
+    """Makes the rendering of the standard deviations of colour and depth.
 
-    Images are "rgb", "depth", "opacity", "thinned", and the standard deviations "uncertainty", of
-    colour (root mean square over the channels), and "depth_uncertainty", scene units; all [R, ...]
-    on the host. Rays are put into buckets by their samples, as for the curvature, so `render`
-    itself must not be jitted. A ray that meets nothing is certain.
+    Rays are put into buckets by their samples, as for the curvature, so it must not be jitted as a
+    whole. A ray that meets nothing is certain.
 
     Args:
-      field, sampler, grid, background: see `make_curvature_fn`.
+      model, grid: see `make_curvature_fn`.
       chunk_samples: slots of one compiled call, on each device.
       mesh: devices that share the rays (see `devices.py`).
+
+    Returns:
+      `render(state, variance [G, 3], rays)`, which gives of R rays the `basic_images`, and the
+      standard deviations "uncertainty", of colour (root mean square over the channels), and
+      "depth_uncertainty", scene units; all [R, ...] on the host.
     """
-    buckets = bucket_sizes(sampler)
-    background = None if background is None else jnp.asarray(background, jnp.float32)
+    buckets = bucket_sizes(model)
 
-    def count_samples(params, sampler_state, rays):
-        samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
-        return samples.sample_mask.sum(-1)
-
-    def render_bucket(params, sampler_state, variance, rays, *, bucket):
-        samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
-        samples = first_slots(samples, bucket)
-        inputs = field.inputs(rays, samples)
-        slopes = field_slopes(partial(field.apply, params["field"]), rays, samples, inputs=inputs)
-        by_colour, rgb = composited_jacobian(slopes, samples.deltas, background=background)
-        by_depth, depth = depth_jacobian(slopes, samples)
-        positions = computed_once(sample_positions(rays, samples))
+    def render_bucket(state, variance, rays, *, bucket):
+        terms = model.ray_terms(state, rays, most_points=bucket, view_ids=None)
+        positions = computed_once(terms.positions)
         deviation = [
             jnp.sqrt(predictive_variance(grid, positions, jacobian, variance) / jacobian.shape[1])
-            for jacobian in (by_colour, by_depth)
+            for jacobian in (terms.colour_jacobian, terms.depth_jacobian)
         ]
         return {
-            "rgb": rgb,
-            "depth": depth,
-            "opacity": render_weights(slopes.density, samples.deltas).sum(-1),
-            "thinned": samples.thinned,
+            "rgb": terms.rgb,
+            "depth": terms.depth,
+            "opacity": terms.opacity,
+            "thinned": terms.thinned,
             "uncertainty": deviation[0],
             "depth_uncertainty": deviation[1],
         }
 
-    count_fn = jit_over_rays(count_samples, mesh, spread=(False, False, True))
+    count_fn = jit_over_rays(model.num_points, mesh, spread=(False, True))
     bucket_fns = {
         bucket: jit_over_rays(
-            partial(render_bucket, bucket=bucket), mesh, spread=(False, False, False, True)
+            partial(render_bucket, bucket=bucket), mesh, spread=(False, False, True)
         )
         for bucket in buckets
     }
 
-    def render(params, sampler_state, variance, rays: Rays) -> dict[str, np.ndarray]:
+    def render(state, variance, rays: Rays) -> dict[str, np.ndarray]:
         num = len(rays.origins)
-        counts = np.asarray(count_fn(params, sampler_state, rays))
-        images, rays = _empty_images(num, background), jax.tree.map(np.asarray, rays)
+        counts = np.asarray(count_fn(state, rays))
+        images, rays = _empty_images(num, model.background), jax.tree.map(np.asarray, rays)
         for bucket, rows, count in bucketed_rows(counts, buckets, chunk_samples, num_shards(mesh)):
             some = jax.tree.map(lambda x, rows=rows: x[rows], rays)
-            found = bucket_fns[bucket](params, sampler_state, variance, some)
+            found = bucket_fns[bucket](state, variance, some)
             for name, values in found.items():
                 images[name][rows[:count]] = np.asarray(values)[:count]
         return images

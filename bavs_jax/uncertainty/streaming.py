@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
+from bavs_jax.arrays import Array
 from bavs_jax.cameras import Cameras, Rays
 from bavs_jax.devices import gather_rays, jit_over_rays, num_shards, over_rays, spread_rays
-from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid
-from bavs_jax.rendering.samplers import Sampler
-from bavs_jax.rendering.sampling import first_slots
-from bavs_jax.training.batches import PixelTable, view_pixel_rays
+from bavs_jax.models.base import ModelState, RadianceModel
+from bavs_jax.pixel_table import PixelTable, view_pixel_rays
+from bavs_jax.progress import Bar, Progress, Track, map_chunks
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 
 RAY_CHUNK = 8192  # rays of one compiled call that makes them, or counts their samples
@@ -25,8 +26,39 @@ RAY_CHUNK = 8192  # rays of one compiled call that makes them, or counts their s
 MAX_GROUP, MAX_GROUP_BYTES = 8, 2**26
 
 
-def table_rays(table: PixelTable, view_ids, pixel_ids, weighting: str) -> dict:
-    """Pixels [N] of views that are trained on, as keywords of `make_curvature_fn`'s `curvature`.
+class RayFacts(TypedDict, total=False):
+    """What is known of each of N rays beside the ray itself; what is left out is None."""
+
+    targets: Array | None  # [N, 3] true colours; needed by `eq11` and `empirical`
+    # [N] int: views trained on that the rays belong to, which a model may read in a way of their
+    # own. None for rays of any other camera, read as when it renders.
+    view_ids: Array | None
+    ray_weight: Array | None  # [N] factor of each ray's contribution; 1 when None
+    group_ids: Array | None  # [N] int: which ray is of which group; when None all are of group 0
+
+
+class CurvatureRays(RayFacts):
+    """N rays as keywords of `CurvatureOfRays`."""
+
+    rays: Rays
+
+
+class CurvatureOver(Protocol):
+    """See `make_curvature_fn`."""
+
+    def __call__(
+        self,
+        state: ModelState,
+        rays: Rays,
+        progress_fn: Progress | None = None,
+        *,
+        num_groups: int = 1,
+        **of_rays: Unpack[RayFacts],
+    ) -> jax.Array: ...
+
+
+def table_rays(table: PixelTable, view_ids, pixel_ids, weighting: str) -> CurvatureRays:
+    """Pixels [N] of views that are trained on, as keywords of `CurvatureOfRays`.
 
     Args:
       table: the scene's pixels.
@@ -66,28 +98,28 @@ def curvature_group_size(num_vertices: int, num_views: int) -> int:
     return max(1, min(MAX_GROUP, fitting, num_views))
 
 
-def bucket_sizes(sampler: Sampler, sizes: tuple[int, ...] = (8, 16, 32, 64)) -> tuple[int, ...]:
-    """Sample slots of each compiled shape: those below the sampler's `num_slots`, and that.
+def bucket_sizes(model: RadianceModel, sizes: tuple[int, ...] = (8, 16, 32, 64)) -> tuple[int, ...]:
+    """Points a ray of each compiled shape: those below the model's `most_points`, and that.
 
-    A dense sampler, all of whose slots are filled, has one bucket.
+    Where every ray has the most points there is one bucket.
     """
-    slots = sampler.num_slots
-    return (*(() if sampler.dense else sorted(b for b in sizes if b < slots)), slots)
+    most = model.most_points
+    return (*(() if model.always_most else sorted(b for b in sizes if b < most)), most)
 
 
 def bucketed_rows(
     counts: np.ndarray, buckets: tuple[int, ...], chunk_samples: int, num_shards: int = 1
-):
+) -> Iterator[tuple[int, np.ndarray, int]]:
     """Rays by bucket: yields (bucket, rows, how many of them are true).
 
     There are `chunk_samples // bucket` rows for each of the shards.
 
-    Rays of no samples are left out; the last rows of a bucket are filled up with copies.
+    Rays of no points are left out; the last rows of a bucket are filled up with copies.
 
     Args:
-      counts: [N] samples of each ray.
+      counts: [N] points of each ray.
       buckets: ascending, from `bucket_sizes`.
-      chunk_samples: slots of one compiled call, on each device.
+      chunk_samples: points of one compiled call, on each device.
       num_shards: devices that share the rows.
     """
     smaller = 0
@@ -102,83 +134,61 @@ class _Rows(NamedTuple):
     """What one compiled call is told of each of its rays."""
 
     rays: Rays
-    target: Any  # [R, 3] or None
-    view_ids: Any  # [R] or None
-    group_ids: Any  # [R]
-    ray_weight: Any  # [R], 0 for padding
+    target: Array | None  # [R, 3]
+    view_ids: Array | None  # [R]
+    group_ids: Array  # [R]
+    ray_weight: Array  # [R], 0 for padding
 
 
 def make_curvature_fn(
-    field: Field,
-    sampler: Sampler,
+    model: RadianceModel,
     grid: DeformationGrid,
     *,
-    background,
     weighting: str = "eq13",
     buckets: tuple[int, ...] = (8, 16, 32, 64),
     chunk_samples: int = 8192,
     mesh: Mesh | None = None,
-) -> Callable:
+) -> CurvatureOver:
     """Makes the streamed raw Jacobian sum (Eqs 10-13) over given rays.
 
-    `vmap(jacrev)` needs a fixed number of samples a ray. Rays are sorted into buckets by how many
-    occupied samples they have, so that short ones are not padded to the longest; rays that meet
-    nothing have no curvature and are not evaluated. A dense sampler makes one bucket of all rays.
+    `vmap(jacrev)` needs a fixed number of points a ray. Rays are sorted into buckets by how many
+    can move their colour, so that short ones are not padded to the longest; rays that meet nothing
+    have no curvature and are not evaluated.
 
     Args:
-      field: the radiance field.
-      sampler: how rays are sampled; its samples are held fixed.
+      model: the radiance model.
       grid: the deformation grid.
-      background: [3] colour behind everything, or None (see `composite_colour`).
       weighting: one of `curvature.WEIGHTINGS`.
-      buckets: sample slots of each compiled shape; the sampler's `num_slots` is added if larger.
-      chunk_samples: slots of one compiled call, on each device.
+      buckets: points a ray of each compiled shape; the model's `most_points` is added if larger.
+      chunk_samples: points of one compiled call, on each device.
       mesh: devices that share the rays (see `devices.py`); each has a sum of its own, and these are
         added at the end.
 
     Returns:
-      `curvature(params, sampler_state, rays [N], progress_fn=None, *, targets=None, view_ids=None,
-      ray_weight=None, group_ids=None, num_groups=1) -> jac_sq_sum [num_groups, G, 3]`, a sum for
-      each group of rays, for any N.
-      - `targets` [N, 3]: true colours; needed by `eq11` and `empirical`.
-      - `view_ids` [N] int: views trained on that the rays belong to, for the field's `inputs`.
-        None for rays of any other camera, which a field reads as it does when it renders.
-      - `ray_weight` [N]: factor of each ray's contribution; 1 when None.
-      - `group_ids` [N] int: which ray is of which group; when None all are of group 0.
-      - `progress_fn(n)` is called with the number of rays done.
+      `curvature(state, rays, **of_rays)`, which gives `jac_sq_sum` [num_groups, G, 3], a sum for
+      each group of rays (see `RayFacts`); each number of groups compiles.
     """
-    slots, buckets = sampler.num_slots, bucket_sizes(sampler, buckets)
-    background = None if background is None else jnp.asarray(background, jnp.float32)
+    buckets = bucket_sizes(model, buckets)
     shards = num_shards(mesh)
-    count_chunk = RAY_CHUNK * shards
 
-    def count_rays(params, sampler_state, rays):
-        samples, _ = sampler.sample(None, params["sampler"], sampler_state, rays)
-        return samples.sample_mask.sum(-1)
+    count_fn = jit_over_rays(model.num_points, mesh, spread=(False, True))
 
-    count_samples = jit_over_rays(count_rays, mesh, spread=(False, False, True))
-
-    def add_part(totals, params, sampler_state, rows, *, bucket):
-        samples, _ = sampler.sample(None, params["sampler"], sampler_state, rows.rays)
-        samples = first_slots(samples, bucket)
+    def add_part(totals, state, rows, *, bucket):
+        terms = model.ray_terms(state, rows.rays, most_points=bucket, view_ids=rows.view_ids)
         total = add_jac_sq_sum(
             totals[0],
-            partial(field.apply, params["field"]),
+            terms,
             grid,
-            rows.rays,
-            samples,
-            background=background,
             target=rows.target,
             ray_weight=rows.ray_weight,
             first_row=rows.group_ids * grid.num_vertices,
             weighting=weighting,
-            inputs=field.inputs(rows.rays, samples, rows.view_ids),
         )
         return total[None]
 
     @partial(jax.jit, static_argnames="bucket", donate_argnums=0)
     def add_chunk(totals, *args, bucket):
-        spread = (True, False, False, True)
+        spread = (True, False, True)
         return over_rays(partial(add_part, bucket=bucket), mesh, spread=spread)(totals, *args)
 
     @partial(jax.jit, static_argnames="num_groups")
@@ -189,19 +199,18 @@ def make_curvature_fn(
     def add_shards(totals):
         return gather_rays(totals.sum(0), mesh)
 
-    def all_counts(params, sampler_state, rays):
+    def all_counts(state, rays):
         num_rays = len(rays.origins)
-        if sampler.dense:
-            return np.full(num_rays, slots)
-        counts = []
-        for rows, num in _chunks(np.arange(num_rays), count_chunk):
-            some = jax.tree.map(lambda x, rows=rows: x[rows], rays)
-            counts.append(np.asarray(count_samples(params, sampler_state, some))[:num])
-        return np.concatenate(counts)
+        if model.always_most:
+            return np.full(num_rays, model.most_points)
+
+        def count(rows):
+            return count_fn(state, jax.tree.map(lambda x: x[rows], rays))
+
+        return map_chunks(count, num_rays, RAY_CHUNK * shards)
 
     def curvature(
-        params,
-        sampler_state,
+        state,
         rays,
         progress_fn=None,
         *,
@@ -215,20 +224,20 @@ def make_curvature_fn(
         everything = _Rows(
             rays,
             target=None if weighting == "eq13" else targets,
-            # So that fields without appearance codes have one compilation, not two.
-            view_ids=view_ids if field.reads_views else None,
+            # So that models which do not read them have one compilation, not two.
+            view_ids=view_ids if model.reads_views else None,
             group_ids=np.zeros(num_rays, np.int32) if group_ids is None else group_ids,
             ray_weight=np.ones(num_rays, np.float32) if ray_weight is None else ray_weight,
         )
         everything = jax.tree.map(np.asarray, everything)
         totals = fresh_totals(num_groups)
-        counts = all_counts(params, sampler_state, everything.rays)
+        counts = all_counts(state, everything.rays)
         report = progress_fn or (lambda num: None)
         report(int((counts == 0).sum()))
         for bucket, rows, num in bucketed_rows(counts, buckets, chunk_samples, shards):
             some = jax.tree.map(lambda x, rows=rows: x[rows], everything)
             some.ray_weight[num:] = 0.0
-            totals = add_chunk(totals, params, sampler_state, some, bucket=bucket)
+            totals = add_chunk(totals, state, some, bucket=bucket)
             # The host would otherwise run ahead and queue every chunk's buffers at once.
             jax.block_until_ready(totals)
             report(num)
@@ -238,7 +247,63 @@ def make_curvature_fn(
     return curvature
 
 
-def _chunks(rows: np.ndarray, size: int):
+class CurvatureOfRays:
+    """Curvature of a model over rays, with progress; compiles once for each weighting."""
+
+    def __init__(
+        self,
+        model: RadianceModel,
+        grid: DeformationGrid,
+        *,
+        group_size: int,
+        track: Track,
+        mesh: Mesh | None = None,
+    ):
+        """Args:
+        model, grid, mesh: see `make_curvature_fn`.
+        group_size: most groups of rays; all calls share its compilations.
+        track: shows progress.
+        """
+        self.group_size = group_size
+        self._track = track
+        self._make = partial(make_curvature_fn, model, grid, mesh=mesh)
+        self._made: dict[str, CurvatureOver] = {}
+
+    def __call__(
+        self,
+        state: ModelState,
+        rays: Rays,
+        label: str | None,
+        *,
+        weighting: str,
+        **of_rays: Unpack[RayFacts],
+    ) -> jax.Array:
+        """`jac_sq_sum` [G, 3], or with `group_ids` [N] that of each group, [group_size, G, 3].
+
+        Args:
+          state: of the model.
+          rays: N rays.
+          label: of the progress; None: none is shown.
+          weighting: one of `curvature.WEIGHTINGS`.
+          **of_rays: see `RayFacts`.
+        """
+        if weighting not in self._made:
+            self._made[weighting] = self._make(weighting=weighting)
+        shown: contextlib.AbstractContextManager[Bar | None] = contextlib.nullcontext(None)
+        if label is not None:
+            shown = self._track(len(rays.origins), label, "rays")
+        with shown as bar:
+            sums = self._made[weighting](
+                state,
+                rays,
+                progress_fn=None if bar is None else bar.advance,
+                num_groups=self.group_size,
+                **of_rays,
+            )
+        return sums if "group_ids" in of_rays else sums[0]
+
+
+def _chunks(rows: np.ndarray, size: int) -> Iterator[tuple[np.ndarray, int]]:
     """Pieces of `rows` of exactly `size`, the last filled up, with their true lengths."""
     for start in range(0, len(rows), size):
         piece = rows[start : start + size]

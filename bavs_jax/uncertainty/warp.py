@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.ndimage import map_coordinates
 
+from bavs_jax.arrays import Array
 from bavs_jax.cameras import Cameras, Rays
 from bavs_jax.numerics import safe_divide
+from bavs_jax.registry import check_known
 from bavs_jax.uncertainty.measures import DEFAULT_TOLERANCE, at_nearest_pixel, look_at_points
 
 QUANTITIES = ("colour", "depth")
@@ -20,9 +22,9 @@ class WarpSources(NamedTuple):
     """Renders of the V views that may be warped; fixed shapes, only the mask changes."""
 
     cameras: Cameras  # V cameras, their images H x W
-    rgb: jax.Array  # [V, H, W, 3] in [0, 1]
-    depth: jax.Array  # [V, H, W] distance along the ray, scene units; 0 where empty
-    mask: jax.Array  # [V] bool, which are trained on; the others cost nothing
+    rgb: Array  # [V, H, W, 3] in [0, 1]
+    depth: Array  # [V, H, W] distance along the ray, scene units; 0 where empty
+    mask: Array  # [V] bool, which are trained on; the others cost nothing
 
 
 def sample_bilinear(image: jax.Array, pixels: jax.Array) -> jax.Array:
@@ -79,10 +81,8 @@ def warp_disagreement(
     Differs from the published code, which takes the colour at the edge of a view's image for
     points outside of it, and has no test for what is hidden.
     """
-    if quantity not in QUANTITIES:
-        raise ValueError(f"quantity: {quantity!r} is unknown; use one of {', '.join(QUANTITIES)}")
-    if combine not in COMBINATIONS:
-        raise ValueError(f"combine: {combine!r} is unknown; use one of {', '.join(COMBINATIONS)}")
+    check_known("quantity", quantity, QUANTITIES)
+    check_known("combine", combine, COMBINATIONS)
     points = rays.origins + depth[:, None] * rays.directions
 
     def difference(camera, image, depth_map, pixels):

@@ -8,11 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.model import RECONSTRUCTION
 from experiments.bench import stages
 from experiments.bench.subject import Subject, changed, draw_candidates, make_subject
 from experiments.bench.timing import fit_growth, timed, timed_runs
-from experiments.build_trainer import build_trainer
+from experiments.build import build_problem
 from experiments.machine import peak_memory_mb
 from experiments.progress import track
 
@@ -36,8 +35,7 @@ def all_series(subject: Subject, state: TrainState, jac_sq_sum, num_rays: int, s
     def training(rays):
         capacity = rays * subject.config.train.capacity // subject.config.train.num_rays
         config = changed(subject.config, train__num_rays=rays, train__capacity=capacity)
-        num_views = len(subject.is_training_view)
-        trainer = build_trainer(config, subject.scene, num_views, RECONSTRUCTION)
+        trainer = build_problem(config, subject.scene).trainer
         return stages.make_training_run(subject, trainer, state, growth.train_calls)
 
     def curvature_on(cells):

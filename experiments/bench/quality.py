@@ -9,12 +9,12 @@ import jax
 import numpy as np
 
 from bavs_jax.active import round_keys
-from bavs_jax.training.batches import view_mask
+from bavs_jax.pixel_table import view_mask
+from bavs_jax.training.fit import fit
 from experiments import runtime
 from experiments.bench.subject import SEED
 from experiments.build import build_problem
 from experiments.build_scene import initial_views, load_config_scene
-from experiments.build_trainer import fit_field
 from experiments.errors import ConfigError, shown
 from experiments.evaluate import evaluate_views, spread_evenly
 from experiments.keys import run_key, stream_key
@@ -59,17 +59,15 @@ def measure_run(config, *, num_views: int, num_test_views: int, every: int, star
     view_ids = spread_evenly(scene.test, num_test_views)
     steps, key = config.train.steps_per_call, run_key(SEED)
     calls_between = -(-every // steps)
-    train = problem.init_train(stream_key(SEED, "init"))
-    num_calls = problem.calls_per_round
+    train = problem.trainer.init(stream_key(SEED, "init"))
+    num_calls = problem.trainer.num_calls
     *_, train_key = round_keys(key, 0)
     paused, curve = 0.0, []
 
     with track(num_calls * steps, f"train on {num_views} views", "steps") as bar:
-        for fitted in fit_field(
-            config,
-            problem.init_train,
-            problem.train_call,
+        for fitted in fit(
             train_key,
+            problem.trainer,
             train,
             problem.table,
             view_mask(problem.table, initial),

@@ -5,15 +5,15 @@ from __future__ import annotations
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 
-from bavs_jax.active import init_active_state
+from bavs_jax import active
+from bavs_jax.active import round_keys
 from bavs_jax.cameras import take
+from bavs_jax.pixel_table import training_pixels, view_mask
 from bavs_jax.rendering.images import render_views
 from bavs_jax.scenes import Scene
-from bavs_jax.training.batches import training_pixels, view_mask
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE
 from bavs_jax.uncertainty.scoring import mean_uncertainty
 from bavs_jax.uncertainty.streaming import table_rays
@@ -22,7 +22,6 @@ from experiments.build import RENDER_CHUNK, build_problem
 from experiments.build_scene import initial_views, load_config_scene
 from experiments.configs import base
 from experiments.keys import run_key, stream_key
-from experiments.progress import track
 from experiments.report.tables import Cell, Table, dash
 
 DEVICE_FILE = "check_device.json"
@@ -77,22 +76,22 @@ def numbers_on(
     """
     with jax.default_device(device):
         problem = build_problem(config, scene, kind)
-        table, train_call = problem.table, problem.train_call
+        table, train_call = problem.table, problem.trainer.call
         initial = initial_views(scene, SEED, config.num_initial)
         is_training = view_mask(table, initial)
         init_key, key = stream_key(SEED, "init"), run_key(SEED)
         if trained is None:
-            state = problem.init_train(init_key)
+            state = problem.trainer.init(init_key)
             for number in range(NUM_STEPS):
                 state, _ = train_call(jax.random.fold_in(key, number), state, table, is_training)
             trained = jax.tree.map(np.asarray, state)
         state = jax.device_put(trained, device)
 
         view_ids, pixel_ids = training_pixels(table, is_training)
-        toolbox = problem.make_toolbox(track)
+        toolbox = problem.toolbox
         weighting = toolbox.laplace.weighting
         jac_sq_sum = toolbox.curvature(
-            state,
+            state.model,
             label=None,
             weighting=weighting,
             **table_rays(table, view_ids, pixel_ids, weighting),
@@ -106,16 +105,13 @@ def numbers_on(
             take(scene.cameras, np.setdiff1d(scene.pool, initial)),
             chunk=RENDER_CHUNK,
         )
-        whole = init_active_state(state, table, initial).replace(
-            calls=jnp.int32(problem.calls_per_round)
-        )
+        whole = active.init(state, table, initial)
         for name in policies:
-            choices = []
-            step = problem.make_step(name, initial, track, "check")
-            step(key, whole, lambda state, choice, to=choices: to.append(choice))
-            found[f"views, {name}"] = choices[0].view_ids
+            acquisition = problem.acquisition(name, initial, "check")
+            choice = active.select(round_keys(key, 1)[0], whole, acquisition)
+            found[f"views, {name}"] = choice.candidates.view_ids[choice.selected]
         # Adam's first mean is a share of the gradient. Last, since the state is given away.
-        state = state.replace(opt_state=problem.init_train(init_key).opt_state)
+        state = state.replace(opt_state=problem.trainer.init(init_key).opt_state)
         state, info = train_call(jax.random.fold_in(key, NUM_STEPS), state, table, is_training)
         moments = jax.tree.leaves(optax.tree_utils.tree_get(state.opt_state, "mu"))
         found["loss"] = info.loss

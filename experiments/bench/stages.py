@@ -10,11 +10,12 @@ import jax
 import numpy as np
 
 from bavs_jax.cameras import Cameras, num_pixels
+from bavs_jax.pixel_table import view_pixel_rays
 from bavs_jax.rendering.images import render_pixels
 from bavs_jax.selection.batch import acquire
 from bavs_jax.selection.context import Context, make_context
 from bavs_jax.selection.policies import get_policy
-from bavs_jax.training.batches import view_pixel_rays
+from bavs_jax.training.fit import Trainer
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.models.laplace import laplace_variance
 from bavs_jax.uncertainty.scoring import mean_uncertainty
@@ -29,7 +30,6 @@ from experiments.bench.subject import (
 )
 from experiments.bench.timing import Ceilings, Work, timed, timed_runs
 from experiments.build import RENDER_CHUNK
-from experiments.build_trainer import Trainer
 from experiments.keys import run_key, stream_key
 from experiments.machine import peak_device_memory_mb, peak_memory_mb
 
@@ -176,7 +176,7 @@ def make_curvature_run(subject: Subject, state: TrainState, num_rays: int) -> Ca
     toolbox, table = subject.toolbox, subject.problem.table
     pixels, weighting = draw_training_pixels(subject, num_rays), toolbox.laplace.weighting
     return lambda: toolbox.curvature(
-        state, label=None, weighting=weighting, **table_rays(table, *pixels, weighting)
+        state.model, label=None, weighting=weighting, **table_rays(table, *pixels, weighting)
     )
 
 

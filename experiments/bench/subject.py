@@ -9,16 +9,16 @@ import jax
 import numpy as np
 from ml_collections import ConfigDict
 
-from bavs_jax.cameras import Cameras, take
+from bavs_jax.cameras import Cameras, reduced_cameras, take
 from bavs_jax.candidates import scene_hemisphere
+from bavs_jax.pixel_table import training_pixels, view_mask
 from bavs_jax.scenes import Scene
-from bavs_jax.training.batches import training_pixels, view_mask
+from bavs_jax.training.fit import Trainer
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation, Toolbox
-from bavs_jax.uncertainty.scoring import reduced_cameras
 from experiments.build import Problem, build_problem
 from experiments.build_scene import initial_views
-from experiments.build_trainer import Trainer, build_trainer, train_aside
+from experiments.build_trainer import train_aside
 from experiments.keys import run_key, stream_key
 from experiments.progress import track
 from experiments.schema import MAX_LOG2_CELLS, MAX_WIDTH, check_options, leaves, several, whole
@@ -98,16 +98,12 @@ def make_subject(config, scene: Scene, num_views: int) -> Subject:
     """
     problem = build_problem(changed(config, lpips_net=""), scene)
     is_training = view_mask(problem.table, initial_views(scene, SEED, num_views))
-    trainer = build_trainer(config, scene, len(is_training), RECONSTRUCTION)
-    sampler = trainer.sampler
+    num_points = jax.jit(problem.model.num_points)
 
-    @jax.jit
     def count_samples(state, rays):
-        samples, _ = sampler.sample(None, state.params["sampler"], state.sampler_state, rays)
-        return samples.sample_mask.sum(-1)
+        return num_points(state.model, rays)
 
-    toolbox = problem.make_toolbox(track)
-    return Subject(config, problem, toolbox, trainer, is_training, count_samples)
+    return Subject(config, problem, problem.toolbox, problem.trainer, is_training, count_samples)
 
 
 def train_field(subject: Subject) -> TrainState:

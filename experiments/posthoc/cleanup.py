@@ -25,13 +25,9 @@ from experiments.trained import TrainedRun
 def make_cleaned_chunk_fn(run: TrainedRun, variance) -> Callable:
     """Makes `cleaned(thresholds [T]) -> (Rays [chunk] -> dict)` of a run's field."""
     tools = run.toolbox
-    field, sampler = tools.fields[tools.kind]
     render = make_cleaned_render_fn(
-        field,
-        sampler,
+        tools.model,
         tools.grid,
-        background=tools.background,
-        capacity=tools.capacity,
         variant=tools.laplace.variant,
         extent=tools.laplace.extent,
     )
@@ -39,7 +35,7 @@ def make_cleaned_chunk_fn(run: TrainedRun, variance) -> Callable:
 
     def cleaned(thresholds):
         thresholds = jnp.asarray(thresholds, jnp.float32)
-        return partial(render, train.params, train.sampler_state, variance, thresholds)
+        return partial(render, train.model, variance, thresholds)
 
     return cleaned
 
@@ -73,7 +69,7 @@ def sweep_views(
                 pixel_sums(
                     counted,
                     run.truth(view)[mask],
-                    background=run.toolbox.background,
+                    background=run.toolbox.model.background,
                     min_opacity=min_opacity,
                 )
             )

@@ -85,18 +85,14 @@ def draw_views(
         ]
         scale = float(noise_scale(np.mean(squares), run.num_rays))
 
-    tools = run.toolbox
-    field, sampler = tools.fields[tools.kind]
-    displaced = make_displaced_render_fn(
-        field, sampler, tools.grid, background=tools.background, capacity=tools.capacity
-    )
+    displaced = make_displaced_render_fn(run.toolbox.model, run.toolbox.grid)
     precision, key = run_precision(run, jac_sq_sum), stream_key(run.seed, "draws")
     by_draw = []
     with track(total * num_draws, f"{run.label}: {num_draws} draws", "rays") as bar:
         for draw in range(num_draws):
             draw_key = jax.random.fold_in(key, draw)
             (theta,) = draw_offsets(draw_key, precision, 1, scale=scale, limit=jnp.asarray(limit))
-            moved = partial(displaced, train.params, train.sampler_state, theta)
+            moved = partial(displaced, train.model, theta)
             rendered = render_views(
                 lambda rays, fn=moved: {"rgb": fn(rays)["rgb"]},
                 cameras,

@@ -18,10 +18,10 @@ from bavs_jax.export.field import (
 from bavs_jax.export.formats import import_extra, nrrd_bytes, ply_bytes
 from bavs_jax.export.mesh import extract_mesh, without_small_parts
 from bavs_jax.fields.deformation import offset_unit
+from bavs_jax.pixel_table import training_pixels
 from bavs_jax.scenes import Scene
 from bavs_jax.scenes.poses import user_points, user_units
 from bavs_jax.scenes.sdf_surface import sample_surface
-from bavs_jax.training.batches import training_pixels
 from bavs_jax.uncertainty.channel import finish_uncertainty
 from experiments.build import RENDER_CHUNK
 from experiments.files import write_arrays, write_atomic

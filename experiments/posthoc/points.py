@@ -24,9 +24,8 @@ def scene_point_fn(run: TrainedRun, variance: jax.Array) -> Callable:
       variance: from `run_variance`.
     """
     toolbox = run.toolbox
-    field, _ = toolbox.fields[toolbox.kind]
-    point_fn = make_point_fn(field, toolbox.grid, variant=toolbox.laplace.variant)
-    return partial(point_fn, run.state.train.params["field"], variance)
+    point_fn = make_point_fn(toolbox.model, toolbox.grid, variant=toolbox.laplace.variant)
+    return partial(point_fn, run.state.train.model, variance)
 
 
 def user_point_fn(run: TrainedRun, variance: jax.Array | None = None) -> Callable:

@@ -9,8 +9,10 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from bavs_jax.cameras import Cameras, num_pixels, take
+from bavs_jax.cameras import Cameras, num_pixels, reduced_cameras, take
 from bavs_jax.candidates import Candidates
+from bavs_jax.pixel_table import num_training_pixels, view_mask
+from bavs_jax.policy_inputs import make_candidate_curvature_fn
 from bavs_jax.selection.batch import SelectionInfo, acquire
 from bavs_jax.selection.context import SelectionError, make_context
 from bavs_jax.selection.information import (
@@ -22,12 +24,10 @@ from bavs_jax.selection.information import (
 )
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.selection.worth import Worth, worth_along
-from bavs_jax.sources import make_candidate_curvature_fn
-from bavs_jax.training.batches import num_training_pixels, view_mask
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
 from bavs_jax.uncertainty.posterior import posterior_precision
-from bavs_jax.uncertainty.scoring import mean_uncertainty, reduced_cameras
+from bavs_jax.uncertainty.scoring import mean_uncertainty
 from experiments.build import RENDER_CHUNK, Problem
 from experiments.evaluate import spread_evenly
 from experiments.keys import stream_key
@@ -96,7 +96,7 @@ def photo_information(
 
     The sum of Eq 13 knows no colours, so a pose is enough.
     """
-    toolbox = problem.make_toolbox(track)
+    toolbox = problem.toolbox
     situation = photo_situation(problem, train, cameras)
     precision = posterior_precision(
         jac_sq_sum,
@@ -109,7 +109,7 @@ def photo_information(
         make_cached_curvature_fn(
             make_candidate_curvature_fn(toolbox, situation, cameras, scale),
             num_vertices=toolbox.grid.num_vertices,
-            group_size=toolbox.group_size,
+            group_size=toolbox.curvature.group_size,
         ),
     )
 
@@ -164,7 +164,7 @@ def suggest(
     fields = {"mean_uncertainty_fn": lambda rows, picked: scores[rows], "information": information}
     if chooser.uncertainty != "laplace" or not chooser.needs <= fields.keys():
         everyone = Candidates(cameras, np.arange(len(cameras)), np.ones(len(cameras), bool))
-        fields |= problem.sources(track)(chooser, source_key, situation, everyone).fields
+        fields |= problem.inputs(chooser, source_key, situation, everyone).fields
     context = make_context(
         cameras.positions,
         training_positions=np.asarray(problem.table.cameras.positions),

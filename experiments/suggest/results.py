@@ -6,13 +6,12 @@ import pathlib
 
 import numpy as np
 
-from bavs_jax.cameras import Cameras, num_pixels, take
+from bavs_jax.cameras import Cameras, num_pixels, reduced_cameras, take
 from bavs_jax.placement.collect import Proposals
 from bavs_jax.rendering.images import render_views
 from bavs_jax.scenes.base import photo_cameras
 from bavs_jax.scenes.poses import user_transforms
 from bavs_jax.selection.route import route_length, shortest_route
-from bavs_jax.uncertainty.scoring import reduced_cameras
 from experiments.build import RENDER_CHUNK, Problem
 from experiments.files import write_json
 from experiments.machine import device_name, peak_memory_mb

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.active import round_keys
+from bavs_jax.pixel_table import view_mask
 from bavs_jax.scenes import Scene, SceneError
-from bavs_jax.training.batches import view_mask
 from bavs_jax.training.checkpoints import Checkpoints
+from bavs_jax.training.fit import fit
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import Situation
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from experiments.build import Problem
-from experiments.build_trainer import fit_field
 from experiments.evaluate import evaluate_views, spread_evenly
 from experiments.files import read_arrays, write_arrays
 from experiments.keys import run_key, stream_key
@@ -46,20 +46,18 @@ def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> Tr
     """
     pool, steps = problem.scene.pool, config.train.steps_per_call
     checkpoints = Checkpoints(folder / "checkpoints", warn_fn=warn)
-    train, calls, restarts = problem.init_train(stream_key(seed, "init")), 0, 0
+    train, calls, restarts = problem.trainer.init(stream_key(seed, "init")), 0, 0
     if (found := checkpoints.restore(train)) is not None:
         train, meta = found
         calls, restarts = meta["calls"], meta["restarts"]
-    num_calls = problem.calls_per_round
+    num_calls = problem.trainer.num_calls
     if calls < num_calls:
         saved_at = time.monotonic()
         *_, key = round_keys(run_key(seed), 0)
         with track((num_calls - calls) * steps, f"train on {len(pool)} photos", "steps") as bar:
-            for fitted in fit_field(
-                config,
-                problem.init_train,
-                problem.train_call,
+            for fitted in fit(
                 key,
+                problem.trainer,
                 train,
                 problem.table,
                 view_mask(problem.table, pool),
@@ -87,7 +85,7 @@ def photo_curvature(problem: Problem, train: TrainState, folder: pathlib.Path, s
     if (kept := read_arrays(path, "jac_sq_sum")) is not None:
         return jnp.asarray(kept["jac_sq_sum"])
     is_training = view_mask(problem.table, problem.scene.pool)
-    toolbox = problem.make_toolbox(track)
+    toolbox = problem.toolbox
     situation = Situation(train, problem.table, is_training, num_rays=0, label="photos")
     jac_sq_sum = training_curvature(
         stream_key(seed, "photos"), toolbox, situation, weighting=toolbox.laplace.weighting

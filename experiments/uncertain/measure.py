@@ -38,7 +38,7 @@ class ModelImages(NamedTuple):
 
 def fit_model(problem: Problem, name: str, key, situation: Situation) -> FittedModel:
     """Fits a model to the training views of a situation."""
-    fns = problem.model_fns(name, track)
+    fns = problem.model_fns(name)
     start = time.perf_counter()
     fitted = jax.block_until_ready(fns.fit(key, situation))
     seconds = time.perf_counter() - start

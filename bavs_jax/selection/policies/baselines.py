@@ -18,7 +18,7 @@ def random_score(key, ctx):
 
 
 def uniform_ranks(positions, view_ids):
-    """Place of each camera in the farthest-point order of all of them.
+    """Place [C] of each camera in the farthest-point order of all of them, 0 .. C - 1.
 
     The order begins with the camera nearest to their mean position, the middle of a front-facing
     capture, and goes on with the one farthest from all before it; ties go to the smallest view id.
@@ -26,9 +26,6 @@ def uniform_ranks(positions, view_ids):
     Args:
       positions: [C, 3] scene units.
       view_ids: [C] int, distinct.
-
-    Returns:
-      [C] int32, a permutation of 0 .. C - 1.
     """
     by_id = jnp.argsort(view_ids)  # also the order of summing, so that no other order matters
     points = positions[by_id]

@@ -7,6 +7,7 @@ import numpy as np
 from bavs_jax.selection.context import require, score_candidates
 from bavs_jax.selection.directional import add_look, directional_gains
 from bavs_jax.selection.information import (
+    Gain,
     add_curvature,
     batch_upper_bound,
     candidate_gains,
@@ -17,8 +18,8 @@ from bavs_jax.selection.policies.distance import nearest_chosen, spread_score
 from bavs_jax.selection.policy import Policy
 
 
-def information_score(key, ctx, *, gain):
-    """`gain(h [n, 3], precision [n, 3]) -> []` of each candidate's h over the posterior."""
+def information_score(key, ctx, *, gain: Gain):
+    """The gain of each candidate's h over the posterior."""
     del key
     information = require(ctx, "information")
     return score_candidates(ctx, partial(candidate_gains, information, gain=gain))

@@ -1,11 +1,17 @@
 """Policies that look at where cameras are, and at no picture."""
 
+from collections.abc import Callable
 from functools import partial
 
+import jax
 import jax.numpy as jnp
 
+from bavs_jax.arrays import Array
 from bavs_jax.selection.distances import masked_nearest, pairwise_distances
-from bavs_jax.selection.policy import Policy
+from bavs_jax.selection.policy import Policy, ScoreFn
+
+# Between camera centres [N, 3] and [M, 3], [N, M]; the third, [3], is the scene centre.
+Distance = Callable[[Array, Array, Array], jax.Array]
 
 
 def euclidean(a, b, centre):
@@ -25,19 +31,19 @@ def great_circle(a, b, centre):
     return jnp.arctan2(sine, (a * b).sum(-1))
 
 
-def nearest_chosen(ctx, distance=euclidean):
+def nearest_chosen(ctx, distance: Distance = euclidean):
     """Distance of each candidate to the nearest training view or pick, [C].
 
     Args:
       ctx: the context.
-      distance: `(a [N, 3], b [M, 3], centre [3]) -> [N, M]`.
+      distance: between cameras.
     """
     chosen = jnp.concatenate([ctx.training_positions, ctx.positions])
     is_chosen = jnp.concatenate([ctx.is_training_view, ctx.picked])
     return masked_nearest(distance(ctx.positions, chosen, ctx.centre), is_chosen)
 
 
-def farthest_score(key, ctx, distance=euclidean):
+def farthest_score(key, ctx, distance: Distance = euclidean):
     """`nearest_chosen`: the next view is the one that is farthest from all (NeRF Director)."""
     del key
     return nearest_chosen(ctx, distance)
@@ -58,7 +64,7 @@ def spread_score(key, ctx):
     return jnp.maximum(nearest[:, None] - squared, 0.0).mean(axis=0)
 
 
-def _greedy(name: str, summary: str, score_fn) -> Policy:
+def _greedy(name: str, summary: str, score_fn: ScoreFn) -> Policy:
     # Distances need no more than `ctx.picked`, so a pick changes nothing else.
     return Policy(name, summary, score_fn, update_fn=lambda ctx, index: ctx, mode="greedy")
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 
 import jax
 
 from bavs_jax.devices import jit_over_rays
 from bavs_jax.fields.flow_field import base_draws
-from bavs_jax.rendering.pixels import basic_images, render_pixels
+from bavs_jax.models.ray_field import RayField
+from bavs_jax.rendering.render import basic_images
 from bavs_jax.uncertainty.measures import colour_variance
 from bavs_jax.uncertainty.model import FLOW, ModelFns, Toolbox, UncertaintyModel
 
@@ -21,22 +23,15 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
     The last draw is the base's mean. "uncertainty" is the variance of colour over the draws,
     "depth_uncertainty" that of depth; "rgb" and "depth" are the means over the draws.
     """
-    field, sampler = toolbox.fields[FLOW]
+    model = toolbox.models[FLOW]
+    if not isinstance(model, RayField):
+        raise TypeError(f"{FLOW}: must be a RayField, whose field is drawn anew")
     noise = base_draws(jax.random.key(DRAWS_SEED), toolbox.num_draws, with_mean=True)
 
-    def images(params, sampler_state, rays):
+    def images(state, rays):
         def render(noise):
-            drawn = field._replace(apply=partial(toolbox.flow.apply, noise=noise))
-            rendering, samples = render_pixels(
-                drawn,
-                sampler,
-                params,
-                sampler_state,
-                rays,
-                background=toolbox.background,
-                capacity=toolbox.capacity,
-            )
-            return basic_images(rendering, samples)
+            drawn = model.field._replace(apply=partial(toolbox.flow.apply, noise=noise))
+            return basic_images(dataclasses.replace(model, field=drawn).render(state, rays))
 
         draws = jax.vmap(render)(noise)
         return {
@@ -45,7 +40,7 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
             "depth_uncertainty": draws["depth"].var(0),
         }
 
-    compiled = jit_over_rays(images, toolbox.mesh, spread=(False, False, True))
+    compiled = jit_over_rays(images, toolbox.mesh, spread=(False, True))
 
     def fit(key, situation):
         if toolbox.kind == FLOW:
@@ -54,7 +49,7 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
 
     def render(fitted, train, rays):
         state = train if fitted is None else fitted
-        return compiled(state.params, state.sampler_state, rays)
+        return compiled(state.model, rays)
 
     return ModelFns(fit, render)
 

@@ -11,8 +11,7 @@ import numpy as np
 
 from bavs_jax.cameras import Cameras
 from bavs_jax.devices import jit_over_rays
-from bavs_jax.rendering.pixels import basic_images, render_pixels
-from bavs_jax.rendering.render import Channel
+from bavs_jax.rendering.render import Channel, basic_images
 from bavs_jax.uncertainty.images import make_image_fn, render_stack
 from bavs_jax.uncertainty.measures import direction_novelty
 from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
@@ -28,38 +27,25 @@ class Covered(NamedTuple):
 
 def make_fns(toolbox: Toolbox) -> ModelFns:
     """Depth maps of the training views are fitted, so that a view covers only what it sees."""
-    field, sampler = toolbox.fields[toolbox.kind]
     depth_images = make_image_fn(toolbox, toolbox.kind)
 
-    def images(params, sampler_state, covered, rays):
+    def images(state, covered, rays):
         novelty = partial(
             direction_novelty,
             cameras=covered.cameras,
             mask=covered.mask,
             depth_maps=covered.depth_maps,
         )
-        rendering, samples = render_pixels(
-            field,
-            sampler,
-            params,
-            sampler_state,
-            rays,
-            background=toolbox.background,
-            capacity=toolbox.capacity,
-            channels={"uncertainty": Channel(novelty)},
-        )
-        return {**basic_images(rendering, samples), **rendering.channels}
+        channels = {"uncertainty": Channel(novelty)}
+        rendering = toolbox.model.render(state, rays, channels=channels)
+        return {**basic_images(rendering), **rendering.channels}
 
-    compiled = jit_over_rays(images, toolbox.mesh, spread=(False, False, False, True))
+    compiled = jit_over_rays(images, toolbox.mesh, spread=(False, False, True))
 
-    def look(train, cameras, mask):
+    def look(train, cameras, mask, scale):
+        depth_fn = partial(depth_images, train)
         return render_stack(
-            partial(depth_images, train),
-            cameras,
-            mask,
-            scale=toolbox.image_scale,
-            chunk=toolbox.chunk,
-            names=("depth",),
+            depth_fn, cameras, mask, scale=scale, chunk=toolbox.chunk, names=("depth",)
         )
 
     def fit(key, situation):
@@ -69,7 +55,7 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
         )
         unused = np.zeros(len(situation.candidates), bool)
         mask = np.concatenate([np.asarray(situation.is_training_view), unused])
-        small, depth_maps = look(situation.train, cameras, mask)
+        small, depth_maps = look(situation.train, cameras, mask, toolbox.image_scale)
         return Covered(small, mask, depth_maps)
 
     def condition(covered, train, picked):
@@ -78,19 +64,11 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
         new = mask & ~covered.mask
         if not new.any():
             return covered
-        # Already reduced: look at them as they are.
-        images = render_stack(
-            partial(depth_images, train),
-            covered.cameras,
-            new,
-            scale=1.0,
-            chunk=toolbox.chunk,
-            names=("depth",),
-        )
-        return covered._replace(mask=mask, depth_maps=covered.depth_maps + images[1])
+        _, more = look(train, covered.cameras, new, 1.0)  # already reduced: as they are
+        return covered._replace(mask=mask, depth_maps=covered.depth_maps + more)
 
     def render(covered, train, rays):
-        return compiled(train.params, train.sampler_state, covered, rays)
+        return compiled(train.model, covered, rays)
 
     return ModelFns(fit, render, condition)
 

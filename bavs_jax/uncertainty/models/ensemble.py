@@ -13,7 +13,7 @@ from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
 def make_fns(toolbox: Toolbox) -> ModelFns:
     """Further fields are trained like the run's own, which is the first member."""
     images = make_image_fn(toolbox, toolbox.kind)
-    known_background = toolbox.background is not None
+    known_background = toolbox.model.background is not None
 
     def fit(key, situation):
         keys = jax.random.split(key, toolbox.ensemble_size - 1)

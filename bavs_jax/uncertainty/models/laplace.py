@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bavs_jax.training.batches import training_pixels
+from bavs_jax.fields.deformation import cell_sides, vertices_in_box
+from bavs_jax.pixel_table import training_pixels
 from bavs_jax.uncertainty.channel import vertex_variance
 from bavs_jax.uncertainty.model import (
     LaplaceOptions,
@@ -15,6 +16,8 @@ from bavs_jax.uncertainty.model import (
     Toolbox,
     UncertaintyModel,
 )
+from bavs_jax.uncertainty.posterior import offset_variance
+from bavs_jax.uncertainty.predictive import make_predictive_fn
 from bavs_jax.uncertainty.scoring import make_render_chunk_fn
 from bavs_jax.uncertainty.streaming import table_rays
 
@@ -29,7 +32,7 @@ def training_curvature(key, toolbox: Toolbox, situation: Situation, weighting: s
         scale = len(view_ids) / most
         view_ids, pixel_ids = view_ids[rows], pixel_ids[rows]
     return scale * toolbox.curvature(
-        situation.train,
+        situation.train.model,
         label=f"{situation.label}: curvature",
         weighting=weighting,
         **table_rays(situation.table, view_ids, pixel_ids, weighting),
@@ -49,14 +52,10 @@ def laplace_variance(jac_sq_sum: jax.Array, num_rays, options: LaplaceOptions) -
 
 def make_fns(toolbox: Toolbox) -> ModelFns:
     """The variance of each vertex is what is fitted; it is rendered as a channel."""
-    field, sampler = toolbox.fields[toolbox.kind]
     options = toolbox.laplace
     render_chunk = make_render_chunk_fn(
-        field,
-        sampler,
+        toolbox.model,
         toolbox.grid,
-        background=toolbox.background,
-        capacity=toolbox.capacity,
         variant=options.variant,
         scale=options.scale,
         extent=options.extent,
@@ -69,7 +68,28 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
         return jax.block_until_ready(jnp.asarray(variance))
 
     def render(fitted, train, rays):
-        return render_chunk(train.params, train.sampler_state, fitted, rays)
+        return render_chunk(train.model, fitted, rays)
+
+    return ModelFns(fit, render)
+
+
+def make_predictive_fns(toolbox: Toolbox) -> ModelFns:
+    """Ours: what the offsets' posterior means for colour and depth (`predictive.py`).
+
+    The variances [G, 3] of the offsets are what is fitted.
+    """
+    render_rays = make_predictive_fn(toolbox.model, toolbox.grid, mesh=toolbox.mesh)
+    offset_std = toolbox.laplace.offset_cells * cell_sides(toolbox.grid)
+
+    def fit(key, situation):
+        jac_sq_sum = training_curvature(key, toolbox, situation, "eq13")
+        variance = offset_variance(jac_sq_sum, offset_std)
+        if toolbox.laplace.extent == "box":
+            variance = variance * vertices_in_box(toolbox.grid)[:, None]
+        return jax.block_until_ready(jnp.asarray(variance, jnp.float32))
+
+    def render(fitted, train, rays):
+        return render_rays(train.model, fitted, rays)
 
     return ModelFns(fit, render)
 
@@ -79,5 +99,10 @@ UNCERTAINTY_MODELS = (
         name="laplace",
         summary="Laplace approximation on the deformation grid: how far a point may be displaced.",
         make_fns=make_fns,
+    ),
+    UncertaintyModel(
+        name="laplace_predictive",
+        summary="Deviation of colour and depth under the Laplace posterior, to first order.",
+        make_fns=make_predictive_fns,
     ),
 )

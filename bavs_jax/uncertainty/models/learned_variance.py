@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import jax
+
 from bavs_jax.rendering.compositing import rendered_variance
+from bavs_jax.rendering.render import RayRendering
 from bavs_jax.uncertainty.images import make_image_fn
 from bavs_jax.uncertainty.measures import variance_reduction
 from bavs_jax.uncertainty.model import VARIANCE, ModelFns, Toolbox, UncertaintyModel
 
 
-def _measures(rendering) -> dict:
+def _measures(rendering: RayRendering) -> dict[str, jax.Array]:
     beta = rendering.values["beta"]
     return {
         "uncertainty": rendered_variance(rendering.weights, beta),

@@ -11,8 +11,7 @@ from bavs_jax.cameras import Cameras, Rays, pixel_rays
 from bavs_jax.scenes.base import Scene
 
 
-@struct.dataclass
-class PixelTable:
+class PixelTable(struct.PyTreeNode):
     """A scene's pixels on the device; which of them are trained on is a mask over views."""
 
     cameras: Cameras  # [V]
@@ -53,8 +52,12 @@ def num_training_pixels(scene: Scene | PixelTable, view_ids) -> np.ndarray:
     return np.diff(before[offsets])[view_ids]
 
 
-@struct.dataclass
-class PixelBatch:
+def training_sizes(table: PixelTable, is_training_view: jax.Array) -> jax.Array:
+    """Pixels of each view that is trained on, masked ones too, and 0 of the others, [V] int."""
+    return jnp.where(is_training_view, jnp.diff(table.offsets), 0)
+
+
+class PixelBatch(struct.PyTreeNode):
     """R training pixels."""
 
     rays: Rays
@@ -86,11 +89,8 @@ def sample_pixels(
       num_rays: R.
       background: b [3], which the photos are shown over; None: see `composite_colour`.
       random_background: see above; does nothing where photos are opaque.
-
-    Returns:
-      A batch of R pixels.
     """
-    sizes = jnp.where(is_training_view, jnp.diff(table.offsets), 0)
+    sizes = training_sizes(table, is_training_view)
     ends = jnp.cumsum(sizes)
     number = jax.random.randint(key, (num_rays,), 0, ends[-1])
     view_ids = jnp.searchsorted(ends, number, side="right")

@@ -1,27 +1,28 @@
 """What a field is trained for: from a batch of rays and samples to a loss.
 
-`objective(key, params, batch, samples) -> Outcome` is a pure function of a field's parameters. The
-samples' own losses and the field's penalty are added by `train.py`.
+An `Objective` is a pure function of a field's parameters. The samples' own losses and the field's
+penalty are added by `ray_field.py`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from bavs_jax.devices import over_rays
-from bavs_jax.fields.base import Field
+from bavs_jax.fields.base import Field, Params
 from bavs_jax.fields.flow_field import FlowField, base_draws
+from bavs_jax.models.losses import colour_loss, flow_loss, gaussian_nll, weighted_mean
 from bavs_jax.numerics import MIN_VARIANCE
+from bavs_jax.pixel_table import PixelBatch
 from bavs_jax.rendering.compositing import rendered_variance
-from bavs_jax.rendering.render import Rendering, render_rays
-from bavs_jax.training.batches import PixelBatch
-from bavs_jax.training.losses import colour_loss, flow_loss, gaussian_nll, weighted_mean
+from bavs_jax.rendering.render import RayRendering, render_rays
+from bavs_jax.rendering.sampling import Samples
 
 
 class Outcome(NamedTuple):
@@ -33,8 +34,18 @@ class Outcome(NamedTuple):
     ray_mask: jax.Array  # [R] bool, false for rays that did not fit the sample buffer
 
 
-def _render_batch(field: Field, capacity: int, mesh: Mesh | None) -> Callable:
-    def render(params, batch: PixelBatch, samples) -> Rendering:
+class Objective(Protocol):
+    """The loss of a field's parameters on a batch of R rays, seen at samples [R, S]."""
+
+    def __call__(
+        self, key: jax.Array, params: Params, batch: PixelBatch, samples: Samples, /
+    ) -> Outcome: ...
+
+
+def _render_batch(
+    field: Field, capacity: int, mesh: Mesh | None
+) -> Callable[[Params, PixelBatch, Samples], RayRendering]:
+    def render(params: Params, batch: PixelBatch, samples: Samples) -> RayRendering:
         return render_rays(
             batch.rays,
             samples,
@@ -48,7 +59,7 @@ def _render_batch(field: Field, capacity: int, mesh: Mesh | None) -> Callable:
     return over_rays(render, mesh, spread=(False, True, True))
 
 
-def make_colour_objective(field: Field, *, capacity: int, mesh: Mesh | None = None) -> Callable:
+def make_colour_objective(field: Field, *, capacity: int, mesh: Mesh | None = None) -> Objective:
     """Mean squared colour error (Eq 5).
 
     Args:
@@ -74,7 +85,7 @@ def make_variance_objective(
     density_weight: float = 0.01,
     through_weights: bool = False,
     mesh: Mesh | None = None,
-) -> Callable:
+) -> Objective:
     """Likelihood of the colours under the rendered variance (ActiveNeRF, Pan et al. 2022).
 
     `mean_rc (C - C*)^2 / (2 U) + mean_r log(U) / 2 + density_weight mean_i sigma_i`, with
@@ -118,7 +129,7 @@ def make_flow_objective(
     entropy_weight: float = 0.01,
     floor: float = 1e-5,
     mesh: Mesh | None = None,
-) -> Callable:
+) -> Objective:
     """Likelihood of the colours under K draws of a distribution over fields (CF-NeRF).
 
     Args:

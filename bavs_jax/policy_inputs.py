@@ -4,34 +4,40 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from bavs_jax.cameras import Cameras, num_pixels, take
+from bavs_jax.arrays import Array
+from bavs_jax.cameras import Cameras, num_pixels, reduced_cameras, take
 from bavs_jax.candidates import Candidates
 from bavs_jax.fields.deformation import vertex_positions, vertices_in_box
+from bavs_jax.pixel_table import PixelTable
+from bavs_jax.progress import Track
 from bavs_jax.scenes.images import area_resize
 from bavs_jax.selection.directional import DirectionalInformation, Look, make_precision_fn
 from bavs_jax.selection.information import (
     DEFAULT_MAX_BYTES,
+    CurvatureFn,
+    DenseCurvatureFn,
     Information,
     make_cached_curvature_fn,
 )
 from bavs_jax.selection.policy import Policy
-from bavs_jax.training.batches import PixelTable
+from bavs_jax.uncertainty.measures import TrueErrorFn
 from bavs_jax.uncertainty.model import ModelFns, Situation, Toolbox
 from bavs_jax.uncertainty.models.laplace import training_curvature
-from bavs_jax.uncertainty.posterior import posterior_precision
-from bavs_jax.uncertainty.scoring import mean_uncertainty, reduced_cameras
-from bavs_jax.uncertainty.streaming import rays_through_pixels
+from bavs_jax.uncertainty.posterior import curvature_factor, posterior_precision, prior_precision
+from bavs_jax.uncertainty.scoring import mean_uncertainty
+from bavs_jax.uncertainty.streaming import CurvatureRays, rays_through_pixels
 
 WEIGHTING = "eq13"  # of candidates: the only one that needs no photo
 
 
-class SourceOptions(NamedTuple):
+class LookOptions(NamedTuple):
     """How candidates are looked at."""
 
     image_scale: float  # of width and height, for the score (Eq 15)
@@ -39,36 +45,62 @@ class SourceOptions(NamedTuple):
     cache_bytes: int = 2**30  # most memory for curvatures of candidates; the others are made anew
 
 
-class Sources(NamedTuple):
+class PolicyInputs(NamedTuple):
     """What a policy may ask for."""
 
-    fields: dict  # of `Context`
+    fields: dict[str, Any]  # of `Context`, by name
     seconds: dict[str, float]  # spent so far on "curvature", "fit" and "score"
 
 
-def make_sources_fn(
-    toolbox: Toolbox,
-    models: Mapping[str, Callable],
-    options: SourceOptions,
-    *,
-    track: Callable,
-    true_error_fn: Callable | None = None,
-) -> Callable:
-    """Makes `sources(policy, key, situation, candidates) -> Sources`.
+# What a policy needs to know of C candidates; what is missing in it is refused by name when the
+# policy asks for it.
+MakeInputs = Callable[[Policy, jax.Array, Situation, Candidates], PolicyInputs]
 
-    Args:
-      toolbox: the parts of a scene.
-      models: name -> `() -> ModelFns`, made when first asked for.
-      options: how candidates are looked at.
-      track: (total, label, unit) -> a context with `advance(n)`, for progress.
-      true_error_fn: (train_state, view_ids [n]) -> mean squared colour error [n] of renders against
-        the photos themselves; None where candidates have none.
-    """
 
-    def make_mean_fn(policy, key, situation, candidates, seconds):
-        fns: ModelFns = models[policy.uncertainty]()
-        stage = "fit" if policy.uncertainty != "laplace" else "curvature"
-        with _clock(seconds, stage):
+class InputMaker:
+    """Makes the inputs of any policy; a `MakeInputs`."""
+
+    def __init__(
+        self,
+        toolbox: Toolbox,
+        model_fns: Callable[[str], ModelFns],
+        options: LookOptions,
+        *,
+        track: Track,
+        true_error_fn: TrueErrorFn | None = None,
+    ):
+        """Args:
+        toolbox: the parts of a scene.
+        model_fns: from the name of an uncertainty model.
+        options: how candidates are looked at.
+        track: shows progress.
+        true_error_fn: of a training state; None where candidates have no photos.
+        """
+        self.toolbox, self.model_fns, self.options = toolbox, model_fns, options
+        self.track, self.true_error_fn = track, true_error_fn
+
+    def __call__(
+        self, policy: Policy, key, situation: Situation, candidates: Candidates
+    ) -> PolicyInputs:
+        """What is missing here is refused by name when the policy asks for it."""
+        seconds = dict.fromkeys(("curvature", "fit", "score"), 0.0)
+        makers: dict[str, Callable[..., Any]] = {
+            "mean_uncertainty_fn": self._mean_uncertainty,
+            "information": self._information,
+            "directional": self._directional,
+        }
+        if self.true_error_fn is not None:
+            makers["true_error_fn"] = partial(self._true_error, self.true_error_fn)
+        fields = {
+            name: makers[name](policy, key, situation, candidates, seconds)
+            for name in sorted(policy.needs)
+            if name in makers
+        }
+        return PolicyInputs(fields, seconds)
+
+    def _mean_uncertainty(self, policy, key, situation, candidates, seconds):
+        fns, options = self.model_fns(policy.uncertainty), self.options
+        with _clock(seconds, "fit" if policy.uncertainty != "laplace" else "curvature"):
             fitted = fns.fit(key, situation)
 
         def mean_fn(indices, picked):
@@ -79,7 +111,7 @@ def make_sources_fn(
                 small = reduced_cameras(take(candidates.cameras, indices), options.image_scale)
                 num_rays = int(num_pixels(small).sum())
                 label = f"{situation.label}: score {len(indices)} views"
-                with track(num_rays, label, "rays") as bar:
+                with self.track(num_rays, label, "rays") as bar:
                     return mean_uncertainty(
                         lambda rays: fns.render(known, situation.train, rays),
                         small,
@@ -90,9 +122,35 @@ def make_sources_fn(
 
         return mean_fn
 
-    def candidate_curvature(situation, candidates, seconds):
+    def _information(self, policy, key, situation, candidates, seconds):
+        with _clock(seconds, "curvature"):
+            jac_sq_sum = training_curvature(key, self.toolbox, situation, WEIGHTING)
+            precision = posterior_precision(
+                jac_sq_sum,
+                num_rays=situation.num_rays,
+                prior_weight=self.toolbox.laplace.prior_weight,
+                weighting=WEIGHTING,
+            )
+        return Information(precision, self._candidate_curvature(situation, candidates, seconds))
+
+    def _directional(self, policy, key, situation, candidates, seconds):
+        curvature_fn = self._candidate_curvature(situation, candidates, seconds)
+        with _clock(seconds, "curvature"):
+            return directional_information(
+                self.toolbox,
+                situation,
+                candidates.cameras,
+                curvature_fn,
+                image_scale=self.options.image_scale,
+                max_bytes=self.options.cache_bytes,
+            )
+
+    def _true_error(self, true_error_fn, policy, key, situation, candidates, seconds):
+        return lambda indices: true_error_fn(situation.train, candidates.view_ids[indices])
+
+    def _candidate_curvature(self, situation, candidates, seconds):
         dense = make_candidate_curvature_fn(
-            toolbox, situation, candidates.cameras, options.image_scale
+            self.toolbox, situation, candidates.cameras, self.options.image_scale
         )
 
         def timed(indices):
@@ -101,58 +159,17 @@ def make_sources_fn(
 
         return make_cached_curvature_fn(
             timed,
-            num_vertices=toolbox.grid.num_vertices,
-            max_bytes=options.cache_bytes,
-            group_size=toolbox.group_size,
+            num_vertices=self.toolbox.grid.num_vertices,
+            max_bytes=self.options.cache_bytes,
+            group_size=self.toolbox.curvature.group_size,
         )
-
-    def make_information(key, situation, candidates, seconds):
-        with _clock(seconds, "curvature"):
-            jac_sq_sum = training_curvature(key, toolbox, situation, WEIGHTING)
-            precision = posterior_precision(
-                jac_sq_sum,
-                num_rays=situation.num_rays,
-                prior_weight=toolbox.laplace.prior_weight,
-                weighting=WEIGHTING,
-            )
-        return Information(precision, candidate_curvature(situation, candidates, seconds))
-
-    def make_directional(situation, candidates, seconds):
-        curvature_fn = candidate_curvature(situation, candidates, seconds)
-        with _clock(seconds, "curvature"):
-            return directional_information(
-                toolbox,
-                situation,
-                candidates.cameras,
-                curvature_fn,
-                image_scale=options.image_scale,
-                max_bytes=options.cache_bytes,
-            )
-
-    def sources(policy: Policy, key, situation: Situation, candidates: Candidates) -> Sources:
-        seconds = dict.fromkeys(("curvature", "fit", "score"), 0.0)
-        makers = {
-            "mean_uncertainty_fn": lambda: make_mean_fn(
-                policy, key, situation, candidates, seconds
-            ),
-            "information": lambda: make_information(key, situation, candidates, seconds),
-            "directional": lambda: make_directional(situation, candidates, seconds),
-        }
-        if true_error_fn is not None:
-            makers["true_error_fn"] = lambda: (
-                lambda indices: true_error_fn(situation.train, candidates.view_ids[indices])
-            )
-        # What is missing here is refused by name when the policy asks for it.
-        return Sources({n: makers[n]() for n in sorted(policy.needs) if n in makers}, seconds)
-
-    return sources
 
 
 def directional_information(
     toolbox: Toolbox,
     situation: Situation,
     cameras: Cameras,
-    curvature_fn: Callable,
+    curvature_fn: CurvatureFn,
     *,
     image_scale: float,
     max_bytes: int = DEFAULT_MAX_BYTES,
@@ -175,7 +192,7 @@ def directional_information(
     precision_fn = make_precision_fn(
         look_fn,
         vertex_positions(toolbox.grid),
-        prior=2.0 * toolbox.laplace.prior_weight,
+        prior=prior_precision(toolbox.laplace.prior_weight),
         max_bytes=max_bytes,
     )
     return DirectionalInformation(
@@ -190,12 +207,12 @@ def training_looks(toolbox: Toolbox, situation: Situation, image_scale: float) -
     a view that was trained on is read with its own code, and without its masked pixels.
     """
     views = np.flatnonzero(situation.is_training_view)
-    view_rays = make_view_rays_fn(situation.table.cameras, image_scale, situation.table)
+    view_rays = _make_view_rays_fn(situation.table.cameras, image_scale, situation.table)
     curvature_fn = make_cached_curvature_fn(
         _make_curvature_fn(toolbox, situation, view_rays),
         num_vertices=toolbox.grid.num_vertices,
         max_bytes=0,
-        group_size=toolbox.group_size,
+        group_size=toolbox.curvature.group_size,
     )
     positions = np.asarray(situation.table.cameras.positions)[views]
     return tuple(Look(rows, h, place) for (rows, h), place in zip(curvature_fn(views), positions))
@@ -203,40 +220,47 @@ def training_looks(toolbox: Toolbox, situation: Situation, image_scale: float) -
 
 def make_candidate_curvature_fn(
     toolbox: Toolbox, situation: Situation, cameras: Cameras, image_scale: float
-) -> Callable:
-    """Makes `curvature(indices [n]) -> [n, G, 3]`: what photos would add to the precision.
+) -> DenseCurvatureFn:
+    """Makes the curvatures of candidates: what photos would add to the precision.
 
     Eq 13 knows no colours, so a pose is enough. The sum runs over the pixels of a reduced image and
     is scaled up to the pixels that the photo would have; it is in the unit of the posterior's
     precision, `(2 / R) jac_sq_sum` with the run's own R, and 0 outside of what counts
     (`LaplaceOptions.extent`). Rays of all n cameras share compiled calls; n is at most
-    `toolbox.group_size`.
+    `toolbox.curvature.group_size`.
     """
-    return _make_curvature_fn(toolbox, situation, make_view_rays_fn(cameras, image_scale))
+    return _make_curvature_fn(toolbox, situation, _make_view_rays_fn(cameras, image_scale))
 
 
-def _make_curvature_fn(toolbox: Toolbox, situation: Situation, view_rays: Callable) -> Callable:
+# The rays of reduced images: all N rays of n views, which view each is of [N] int32 from 0 on, and
+# how many pixels of the photo a ray stands for [n].
+ViewRays = Callable[[np.ndarray], tuple[CurvatureRays, np.ndarray, np.ndarray]]
+
+
+def _make_curvature_fn(
+    toolbox: Toolbox, situation: Situation, view_rays: ViewRays
+) -> DenseCurvatureFn:
     """`make_candidate_curvature_fn` of the cameras of `view_rays`."""
-    counts = 1.0
+    counts: Array | float = 1.0
     if toolbox.laplace.extent == "box":
         counts = vertices_in_box(toolbox.grid)[:, None]
 
     def curvature(indices):
         of_rays, places, scale = view_rays(indices)
-        added = toolbox.curvature(
-            situation.train, label=None, weighting=WEIGHTING, group_ids=places, **of_rays
-        )
-        scale = (2.0 / situation.num_rays * scale).astype(np.float32)[:, None, None]
+        of_rays["group_ids"] = places
+        added = toolbox.curvature(situation.train.model, label=None, weighting=WEIGHTING, **of_rays)
+        scale = (curvature_factor(situation.num_rays, WEIGHTING) * scale).astype(np.float32)[
+            :, None, None
+        ]
         return counts * scale * added[: len(indices)]
 
     return curvature
 
 
-def make_view_rays_fn(cameras: Cameras, image_scale: float, table: PixelTable | None = None):
-    """Makes `view_rays(indices [n]) -> (of_rays, places, scale)`: the rays of reduced images.
-
-    `of_rays` are keywords of `Toolbox.curvature` for all N rays, `places` [N] int32 says of which
-    of the n views each is, and `scale` [n] is how many pixels of the photo a ray stands for.
+def _make_view_rays_fn(
+    cameras: Cameras, image_scale: float, table: PixelTable | None = None
+) -> ViewRays:
+    """Makes the rays of reduced images.
 
     Args:
       cameras: of which `indices` are; a field reads them as it does when it renders.
@@ -251,7 +275,7 @@ def make_view_rays_fn(cameras: Cameras, image_scale: float, table: PixelTable | 
         num_rays = small_rays[indices]
         views = np.repeat(indices, num_rays).astype(np.int32)
         pixel_ids = np.concatenate([np.arange(num, dtype=np.int32) for num in num_rays])
-        of_rays = {"rays": rays_through_pixels(small, views, pixel_ids)}
+        of_rays: CurvatureRays = {"rays": rays_through_pixels(small, views, pixel_ids)}
         if table is not None:
             of_rays["view_ids"] = views
             of_rays["ray_weight"] = _unmasked_shares(table, indices, np.asarray(small.sizes))
@@ -281,7 +305,7 @@ def _unmasked_shares(table: PixelTable, view_ids, sizes: np.ndarray) -> np.ndarr
 
 
 @contextlib.contextmanager
-def _clock(seconds: dict[str, float], name: str):
+def _clock(seconds: dict[str, float], name: str) -> Iterator[None]:
     """Adds the time of a block to one entry of a table."""
     start = time.perf_counter()
     yield

@@ -9,14 +9,11 @@ from bavs_jax.numerics import safe_divide
 
 
 def colour_loss(rgb: jax.Array, target: jax.Array, ray_weight: jax.Array) -> jax.Array:
-    """Mean squared colour error over rays and channels (Eq 5).
+    """Mean squared colour error over rays and channels (Eq 5), []; 0 if every weight is 0.
 
     Args:
       rgb, target: [R, 3] in [0, 1].
       ray_weight: [R] >= 0; 0 leaves a ray out of the mean.
-
-    Returns:
-      [] mean; 0 if every weight is 0.
 
     Differs from the paper: a mean over channels, not a sum, so that PSNR is `-10 log10` of it.
     """
@@ -45,7 +42,7 @@ def weighted_mean(values: jax.Array, weights: jax.Array) -> jax.Array:
 def kernel_bandwidth(
     draws: jax.Array, *, exponent: float = 1.0 / 7.0, floor: float = 1e-5
 ) -> jax.Array:
-    """Width of the kernels about K rendered colours, one per channel, constant in derivatives.
+    """Widths [R, 3] of the kernels about K rendered colours, constant in derivatives.
 
     `h = std K / (K - 1) (0.8 / K)^exponent + floor`: Silverman's rule in three dimensions, with the
     standard deviation over `K - 1` widened a little more, as CF-NeRF's code has it.
@@ -54,9 +51,6 @@ def kernel_bandwidth(
       draws: [K, R, 3] colours of K fields.
       exponent: 1/7 is Silverman's. CF-NeRF's code has -1/7, which is 2.9 times as wide at K = 32.
       floor: > 0, added.
-
-    Returns:
-      [R, 3].
 
     Raises:
       ValueError: fewer than two draws, which have no spread.
@@ -70,7 +64,7 @@ def kernel_bandwidth(
 
 
 def kernel_log_density(draws: jax.Array, target: jax.Array, bandwidth: jax.Array) -> jax.Array:
-    """Log-density of the true colour under Gaussian kernels about K rendered ones, nats.
+    """Log-density [R] of the true colour under Gaussian kernels about K rendered ones, nats.
 
     `log mean_k prod_c N(target_c; draws_kc, bandwidth_c^2)`.
 
@@ -78,9 +72,6 @@ def kernel_log_density(draws: jax.Array, target: jax.Array, bandwidth: jax.Array
       draws: [K, R, 3].
       target: [R, 3].
       bandwidth: [R, 3] > 0.
-
-    Returns:
-      [R].
 
     Numerics: a log-sum-exp, so that a colour far from all draws still pulls the nearest ones. At
     a bandwidth of 1e-5 that pull is up to 1e10, finite.
@@ -99,16 +90,13 @@ def colour_likelihood_loss(
     exponent: float = 1.0 / 7.0,
     floor: float = 1e-5,
 ) -> jax.Array:
-    """Mean over rays of the negative log-density of the true colour, nats.
+    """Mean over rays of the negative log-density of the true colour, nats; 0 if every weight is 0.
 
     Args:
       draws: [K, R, 3] colours of the same rays in K fields.
       target: [R, 3] true colours.
       ray_weight: [R] >= 0; 0 leaves a ray out of the mean.
       exponent, floor: see `kernel_bandwidth`.
-
-    Returns:
-      [] mean; 0 if every weight is 0.
 
     Differs from CF-NeRF's code: one kernel in three dimensions, which its bandwidth is for, where
     the code averages three densities of one channel each, of a third of this size; and no 1e-5
@@ -122,12 +110,11 @@ def colour_likelihood_loss(
 def mean_log_prob(log_prob: jax.Array, sample_mask: jax.Array) -> jax.Array:
     """Mean of `log q` over draws and valid samples: minus the field's entropy per sample, nats.
 
+    0 if there is no valid sample.
+
     Args:
       log_prob: [K, ...] of `FlowField.apply`, K draws.
       sample_mask: [...] bool, which samples are valid.
-
-    Returns:
-      [] mean; 0 if there is no valid sample.
 
     Differs from CF-NeRF's code: it averages the base's log-density over colour channels, where
     the logarithm of a joint density is a sum.
@@ -147,7 +134,7 @@ def flow_loss(
     exponent: float = 1.0 / 7.0,
     floor: float = 1e-5,
 ) -> jax.Array:
-    """CF-NeRF's loss: `colour_likelihood_loss + entropy_weight * mean_log_prob`.
+    """CF-NeRF's loss, nats: `colour_likelihood_loss + entropy_weight * mean_log_prob`.
 
     The first term fits the draws to what is seen; the second rewards the spread of what is not.
 
@@ -155,9 +142,6 @@ def flow_loss(
       draws, target, ray_weight, exponent, floor: see `colour_likelihood_loss`.
       log_prob, sample_mask: see `mean_log_prob`.
       entropy_weight: of the second term.
-
-    Returns:
-      [] nats.
     """
     likelihood = colour_likelihood_loss(draws, target, ray_weight, exponent=exponent, floor=floor)
     return likelihood + entropy_weight * mean_log_prob(log_prob, sample_mask)

@@ -1,0 +1,1 @@
+"""Radiance models: what is trained, rendered and asked how its colours change."""

@@ -1,0 +1,90 @@
+"""What tiny runs of fixed seeds come to, for each kind of field, sampler, model and policy.
+
+    python -m tests.goldens OUT.json
+
+`tests/goldens.json` was made so; `test_goldens.py` compares. A change that is meant to change
+numbers makes the file anew and says why.
+"""
+
+import json
+import pathlib
+import subprocess
+import sys
+import tempfile
+
+from bavs_jax.selection.policies import POLICIES
+from tests.toy_runs import toy_flags
+
+ROOT = pathlib.Path(__file__).parents[1]
+SMALL_NETWORKS = {
+    "nerf_mlp__depth": 2,
+    "nerf_mlp__width": 16,
+    "nerf_mlp__skip": 1,
+    "mip_mlp__depth": 2,
+    "mip_mlp__width": 16,
+    "mip_mlp__proposal_width": 8,
+    "coarse_to_fine__num_coarse": 8,
+    "coarse_to_fine__num_fine": 8,
+    "proposal__num_proposals": "(12,8)",
+    "proposal__num_samples": 8,
+    "proposal__log2_table_size": 10,
+    "proposal__num_levels": 1,
+    "num_rounds": 1,
+}
+CASES = {
+    "all policies": {"policies": repr(tuple(POLICIES))},
+    "proposals": {"sampler_kind": "proposal", **SMALL_NETWORKS},
+    "nerf_mlp": {"field_kind": "nerf_mlp", **SMALL_NETWORKS},
+    "nerf_mlp, proposals": {
+        "field_kind": "nerf_mlp",
+        "sampler_kind": "proposal",
+        **SMALL_NETWORKS,
+    },
+    "mip_mlp": {"field_kind": "mip_mlp", **SMALL_NETWORKS},
+    "poses on a hemisphere": {"candidates__source": "hemisphere", "num_rounds": 1},
+    "training on": {"from_scratch": "False", "uncertainty__weighting": "eq11"},
+    "bayesrays": {
+        "uncertainty__variant": "bayesrays",
+        "uncertainty__weighting": "empirical",
+        "uncertainty__scale": "sigma",
+        "uncertainty__max_rays": 100,
+        "num_rounds": 1,
+    },
+}
+
+
+def run_case(options: dict) -> dict:
+    """Views chosen and measures of each round, by policy."""
+    with tempfile.TemporaryDirectory() as folder:
+        flags = toy_flags(**{"policies": "('bavs','d_optimal')", **options})
+        _script("active_selection", folder, flags)
+        runs = json.loads((pathlib.Path(folder) / "summary.json").read_text())["runs"]
+    names = ("selected", "psnr", "ssim", "depth_mae")
+    return {run["policy"]: [{n: row[n] for n in names} for row in run["rounds"]] for run in runs}
+
+
+def run_models() -> dict:
+    """AUSE of every uncertainty model, on its own field and on one common field."""
+    with tempfile.TemporaryDirectory() as folder:
+        more = {"evaluation__num_views": 2, "num_rounds": 0}
+        _script("evaluate_uncertainty", folder, toy_flags(**more))
+        rows = json.loads((pathlib.Path(folder) / "uncertainty.json").read_text())["rows"]
+    return {row["model"]: {field: row[field] for field in ("own", "common")} for row in rows}
+
+
+def _script(name: str, folder: str, flags: list[str]) -> None:
+    command = [sys.executable, "-m", f"experiments.{name}", f"--workdir={folder}", *flags]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command)}: {done.stderr[-2000:]}")
+
+
+def main(out: str) -> None:
+    """Runs all cases and writes what they came to."""
+    found = {name: run_case(options) for name, options in CASES.items()}
+    found["models"] = run_models()
+    pathlib.Path(out).write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
