@@ -17,8 +17,8 @@ from bavs_jax.training.train import TrainInfo, TrainState
 from bavs_jax.uncertainty.model import Situation
 from experiments.build_trainer import Trainer, train_aside
 from experiments.progress import track
-from experiments.report.results import Run
-from experiments.report.tables import final_table
+from experiments.reporting.results import Run
+from experiments.reporting.run_tables import final_table
 from experiments.suggest.training import train_field
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
