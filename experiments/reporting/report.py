@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +12,6 @@ from markupsafe import Markup
 from experiments.reporting import camera_map, pictures, plots, run_tables, stats
 from experiments.reporting.page import FOLDER, write_template
 from experiments.reporting.results import (
-    Round,
     Run,
     bound_words,
     load_acquisition,
@@ -47,127 +45,28 @@ def write_report(workdir: str | os.PathLike) -> Path:
     Raises:
       ReportError: a file is missing, broken or of another schema version.
     """
-    path = Path(workdir) / "report.html"
-    write_template(path, FOLDER / "report.html", **_content(load_runs(Path(workdir))))
-    return path
-
-
-def _content(runs: list[Run]) -> dict:
-    """Everything that the template names."""
+    runs = load_runs(Path(workdir))
     focus = stats.focus_policy(policies_of(runs))
     # In the order of the file, but ours first: it gets the first colour.
     policies = sorted(policies_of(runs), key=lambda p: p != focus)
+    by_policy = {p: [run for run in runs if run.policy == p] for p in policies}
+    by_policy = {p: sorted(some, key=lambda run: run.seed) for p, some in by_policy.items()}
     coloured = plots.in_colour(runs, policies, focus)
-    qualities = [plots.quality_figure(runs, policies, m, coloured) for m in stats.MEASURES]
-    qualities = [
-        plots.to_svg(figure, salt=f"quality-{m.key}", label=f"{m.label} against training views")
-        for m, figure in zip(stats.MEASURES, qualities)
-        if figure is not None
-    ]
-    found = {run.label: load_pictures(run) for run in runs}
-    known = [arrays for arrays in found.values() if arrays is not None]
-    limits = pictures.uncertainty_limits(known)
-
-    def strips(run: Run, number: int) -> dict:
-        arrays, rows, views = found[run.label], None, ""
-        if arrays is not None:
-            side = MAX_SIDE_FOLDED if number else MAX_SIDE
-            rows = pictures.strips(arrays, limits, max_side=side)
-            last = int(arrays["round"])
-            views = f"after round {last}"
-            if 0 <= last < len(run.rounds):
-                views = f"trained on {run.rounds[last]['num_views']} views"
-        return {"label": run.label, "views": views, "rows": rows}
-
-    def maps(run: Run, number: int) -> dict:
-        acquisition = load_acquisition(run)
-        if acquisition is None:
-            return {"label": run.label, "svg": None, "rounds": []}
-        rounds = make_rounds(acquisition)
-        salt = f"map{policies.index(run.policy)}-{number}"
-        return {
-            "label": run.label,
-            "svg": Markup(camera_map.map_plot(acquisition, rounds, salt=salt)),
-            "rounds": [(_round_title(run, one), run_tables.choice_table(one)) for one in rounds],
-        }
-
-    def sections(make_entry: Callable[[Run, int], dict]) -> list[dict]:
-        """Of each policy: its first seed, and the others to unfold."""
-        made = []
-        for policy in policies:
-            mine = sorted((run for run in runs if run.policy == policy), key=lambda run: run.seed)
-            first, *others = (make_entry(run, number) for number, run in enumerate(mine))
-            made.append({"policy": policy, "first": first, "others": others})
-        return made
-
-    scene, compared = _about(runs, policies)
+    num_views = stats.common_num_views(runs)
+    finals = {p: stats.over_seeds(runs, p, "psnr", num_views) for p in coloured}
+    colours = plots.policy_style(coloured)
+    qualities, missing = [], []
+    for measure in stats.MEASURES:
+        figure = plots.quality_figure(runs, policies, measure, coloured)
+        if figure is not None:
+            label = f"{measure.label} against training views"
+            svg = plots.to_svg(figure, salt=f"quality-{measure.key}", label=label)
+            qualities.append(Markup(svg))
+        elif runs:
+            missing.append(run_tables.missing_measure(measure, runs))
     gaps = plots.gap_plot(runs, policies, coloured)
     timing = plots.timing_plot(runs, policies)
-    return {
-        "title": runs[0].result["scene"]["name"] if runs else "no runs",
-        "headline": make_headline(runs, policies),
-        "scene": scene,
-        "compared": compared,
-        "tiles": _tiles(runs, coloured),
-        "num_grey": len(policies) - len(coloured),
-        "gaps": gaps and Markup(gaps),
-        "incomplete": [run.label for run in runs if not run.completed],
-        "qualities": [Markup(svg) for svg in qualities],
-        "missing": _missing(runs),
-        "final": run_tables.final_table(runs, policies),
-        "by_round": run_tables.rounds_table(runs, policies),
-        "all_runs": run_tables.runs_table(runs),
-        "pictures": sections(strips),
-        "bars": pictures.colour_bars(limits) if known else [],
-        "maps": sections(maps),
-        "timing": timing and Markup(timing),
-        "timing_table": run_tables.timing_table(runs, policies),
-        "making": _making(runs),
-    }
-
-
-def _tiles(runs: list[Run], policies: list[str]) -> list[dict]:
-    """The final PSNR of each policy in large type."""
-    num_views = stats.common_num_views(runs)
-    tiles = []
-    for policy, (colour, _) in plots.policy_style(policies).items():
-        interval = stats.over_seeds(runs, policy, "psnr", num_views)
-        if interval is not None:
-            below = "one seed"
-            if interval.half is not None:
-                below = f"± {interval.half:.2f} dB, {interval.num} seeds"
-            number = f"{interval.mean:.2f}"
-            tiles.append({"policy": policy, "colour": colour, "number": number, "below": below})
-    return tiles
-
-
-def _missing(runs: list[Run]) -> list[str]:
-    """Measures that no run has, with the reason."""
-    values = {
-        m: [run.value(m.key, r["num_views"]) for run in runs for r in run.rounds]
-        for m in stats.MEASURES
-    }
-    lacking = [m for m, found in values.items() if all(value is None for value in found)]
-    return [run_tables.missing_measure(m, runs) for m in lacking] if runs else []
-
-
-def _round_title(run: Run, one: Round) -> str:
-    """How the candidates became the chosen ones, in a line."""
-    words = f"Round {one.number}: {len(one.selected)} chosen of {len(one.candidates)} candidates"
-    info = run.rounds[one.number] if one.number < len(run.rounds) else {}
-    if all(choice.score is None for choice in one.choices):
-        words += ", without scores"
-    if info.get("num_survivors") is not None or not one.survives.all():
-        words += f", {int(one.survives.sum())} left by the distance filter"
-    if info.get("farthest_overlap") is not None:
-        words += f"; farthest-view would share {info['farthest_overlap']}"
-    if info.get("batch_bound"):
-        words += f"; {bound_words(info['batch_bound'])}"
-    return words
-
-
-def _making(runs: list[Run]) -> dict:
-    """Commands, devices, versions and configs, each kind once."""
+    limits, strips = _strips(by_policy)
     configs: dict[str, list[str]] = {}
     versions: dict[str, set[str]] = {}
     for run in runs:
@@ -175,12 +74,62 @@ def _making(runs: list[Run]) -> dict:
         configs.setdefault(text, []).append(run.label)
         for package, version in run.result.get("versions", {}).items():
             versions.setdefault(package, set()).add(str(version))
-    return {
-        "commands": sorted({run.result.get("command", "") for run in runs} - {""}),
-        "devices": sorted({str(run.result.get("device", "")) for run in runs} - {""}),
-        "versions": [(name, ", ".join(sorted(v))) for name, v in sorted(versions.items())],
-        "configs": [{"text": text, "runs": "; ".join(who)} for text, who in configs.items()],
-    }
+    path = Path(workdir) / "report.html"
+    write_template(
+        path,
+        FOLDER / "report.html",
+        runs=runs,
+        policies=policies,
+        by_policy=by_policy,
+        num_views=[r["num_views"] for run in runs for r in run.rounds],
+        num_seeds=len({run.seed for run in runs}),
+        headline=make_headline(runs, policies),
+        tiles=[(p, colours[p][0], psnr) for p, psnr in finals.items() if psnr is not None],
+        num_grey=len(policies) - len(coloured),
+        gaps=gaps and Markup(gaps),
+        incomplete=[run.label for run in runs if not run.completed],
+        qualities=qualities,
+        missing=missing,
+        final=run_tables.final_table(runs, policies),
+        by_round=run_tables.rounds_table(runs, policies),
+        all_runs=run_tables.runs_table(runs),
+        strips=strips,
+        bars=pictures.colour_bars(limits) if strips else [],
+        maps=_maps(by_policy),
+        bound_words=bound_words,
+        timing=timing and Markup(timing),
+        timing_table=run_tables.timing_table(runs, policies),
+        versions=versions,
+        configs=configs,
+    )
+    return path
+
+
+def _strips(by_policy: dict[str, list[Run]]) -> tuple[tuple[float, float], dict]:
+    """The scale of all uncertainties, and by run its round and the pictures of each view."""
+    found = {run.label: load_pictures(run) for some in by_policy.values() for run in some}
+    found = {label: arrays for label, arrays in found.items() if arrays is not None}
+    limits = pictures.uncertainty_limits([*found.values()])
+    large = {some[0].label for some in by_policy.values()}
+    strips = {}
+    for label, arrays in found.items():
+        side = MAX_SIDE if label in large else MAX_SIDE_FOLDED
+        strips[label] = int(arrays["round"]), pictures.strips(arrays, limits, max_side=side)
+    return limits, strips
+
+
+def _maps(by_policy: dict[str, list[Run]]) -> dict[str, tuple]:
+    """By run, the maps of its rounds, and each round with the table of its choices."""
+    maps = {}
+    for number, some in enumerate(by_policy.values()):
+        for place, run in enumerate(some):
+            acquisition = load_acquisition(run)
+            if acquisition is not None:
+                rounds = make_rounds(acquisition)
+                svg = camera_map.map_plot(acquisition, rounds, salt=f"map{number}-{place}")
+                tables = [(one, run_tables.choice_table(one)) for one in rounds]
+                maps[run.label] = Markup(svg), tables
+    return maps
 
 
 # --- the result in plain words ---
@@ -231,26 +180,6 @@ def make_headline(runs: list[Run], policies: list[str]) -> Headline:
             f"{reference} has with {num_views}."
         )
     return Headline(result, _verdict_words(first.gap, focus, reference), tuple(more))
-
-
-def _about(runs: list[Run], policies: list[str]) -> tuple[str, str]:
-    """The scene, and what was compared."""
-    if not runs:
-        return "No scene", "no policy"
-    scene = runs[0].result["scene"]
-    width, height = scene["image_size"]
-    about = (
-        f"{scene['name']}: a {scene['kind']} scene with {scene['num_pool']} views to choose from "
-        f"and {scene['num_test']} test views of {width} × {height} pixels"
-    )
-    *others, last = policies
-    names = f"policies {', '.join(others)} and {last}" if others else f"policy {last}"
-    numbers = [r["num_views"] for run in runs for r in run.rounds]
-    if numbers:
-        fewest, most = min(numbers), max(numbers)
-        names += f", training sets of {fewest}{f' to {most}' if most > fewest else ''} views"
-    seeds = len({run.seed for run in runs})
-    return about, f"{names}, {seeds} seed{'s' if seeds > 1 else ''}"
 
 
 def _gap_words(gap: stats.Interval) -> str:
