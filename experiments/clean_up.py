@@ -115,18 +115,10 @@ def _number(value) -> float | None:
 
 def make_cleaned_chunk_fn(run: TrainedRun, variance) -> Callable:
     """Makes `cleaned(thresholds [T]) -> (Rays [chunk] -> dict)` of a run's field."""
-    tools = run.toolbox
-    field, sampler = tools.fields[tools.kind]
-    render = make_cleaned_render_fn(
-        field,
-        sampler,
-        tools.grid,
-        background=tools.background,
-        capacity=tools.capacity,
-        variant=tools.laplace.variant,
-        extent=tools.laplace.extent,
-    )
-    train = run.state.train
+    tools, train = run.toolbox, run.state.train
+    options = {"background": tools.background, "capacity": tools.capacity}
+    options |= {"variant": tools.laplace.variant, "extent": tools.laplace.extent}
+    render = make_cleaned_render_fn(*tools.fields[tools.kind], tools.grid, **options)
 
     def cleaned(thresholds):
         thresholds = jnp.asarray(thresholds, jnp.float32)

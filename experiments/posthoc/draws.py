@@ -86,10 +86,8 @@ def draw_views(
         scale = float(noise_scale(np.mean(squares), run.num_rays))
 
     tools = run.toolbox
-    field, sampler = tools.fields[tools.kind]
-    displaced = make_displaced_render_fn(
-        field, sampler, tools.grid, background=tools.background, capacity=tools.capacity
-    )
+    options = {"background": tools.background, "capacity": tools.capacity}
+    displaced = make_displaced_render_fn(*tools.fields[tools.kind], tools.grid, **options)
     precision, key = run_precision(run, jac_sq_sum), stream_key(run.seed, "draws")
     by_draw = []
     with track(total * num_draws, f"{run.label}: {num_draws} draws", "rays") as bar:
@@ -97,24 +95,18 @@ def draw_views(
             draw_key = jax.random.fold_in(key, draw)
             (theta,) = draw_offsets(draw_key, precision, 1, scale=scale, limit=jnp.asarray(limit))
             moved = partial(displaced, train.params, train.sampler_state, theta)
+
+            def render_rgb(rays, moved=moved):
+                return {"rgb": moved(rays)["rgb"]}
+
             rendered = render_views(
-                lambda rays, fn=moved: {"rgb": fn(rays)["rgb"]},
-                cameras,
-                view_ids,
-                chunk=RENDER_CHUNK,
-                progress_fn=bar.advance,
+                render_rgb, cameras, view_ids, chunk=RENDER_CHUNK, progress_fn=bar.advance
             )
             by_draw.append([image["rgb"] for image in rendered])
-    views = [
-        ViewDraws(
-            int(v),
-            image["rgb"],
-            image["opacity"],
-            image["uncertainty"],
-            draws=np.stack([draw[i] for draw in by_draw]),
-        )
-        for i, (v, image) in enumerate(zip(view_ids, images))
-    ]
+    views = []
+    for view, image, draws in zip(view_ids, images, zip(*by_draw)):
+        shown = (image[name] for name in ("rgb", "opacity", "uncertainty"))
+        views.append(ViewDraws(int(view), *shown, np.stack(draws)))
     return views, scale
 
 

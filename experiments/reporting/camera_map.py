@@ -165,8 +165,8 @@ def _draw_candidates(axes: Axes, points, rounds: list[Round], acquisition, norm)
 def _draw_chosen(axes: Axes, points, this: Round, norm) -> None:
     """The views of this round, ringed and with its number."""
     chosen = points[this.selected]
-    scores = [choice.score for choice in this.choices]
-    face = ["white" if s is None or norm is None else _colours(s, norm) for s in scores]
+    scores = this.selected_scores
+    face = [_colours(s, norm) if norm is not None and np.isfinite(s) else "white" for s in scores]
     look = {"edgecolors": plots.VERMILION, "linewidths": 2.2, "zorder": 7}
     axes.scatter(*chosen.T, s=70, c=face or None, **look)
     for x, y in chosen:

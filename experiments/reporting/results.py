@@ -121,20 +121,6 @@ def _load_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray] | N
 
 
 @dataclasses.dataclass(frozen=True)
-class Choice:
-    """One chosen view as it looked when it was chosen."""
-
-    view_id: int
-    name: str
-    score: float | None  # None: the policy gave none
-    rank: int | None  # 1 is the highest score of the round
-    num_scored: int
-    rank_left: int | None  # the same among those that the distance filter left
-    num_left: int
-    distance: float  # to the nearest training view, scene units
-
-
-@dataclasses.dataclass(frozen=True)
 class Round:
     """One round of choosing; view ids are rows of `positions`."""
 
@@ -142,8 +128,15 @@ class Round:
     candidates: np.ndarray  # [C] views that could have been chosen
     survives: np.ndarray  # [C] bool, passed the distance filter
     scores: np.ndarray  # [C], NaN where not scored
-    selected: np.ndarray  # [K]
-    choices: tuple[Choice, ...]
+    selected: np.ndarray  # [K] views, as the next three
+    names: list[str]
+    selected_scores: np.ndarray  # NaN where not scored
+    distances: np.ndarray  # to the nearest training view, scene units
+
+    @property
+    def is_scored(self) -> bool:
+        """Whether the policy gave any chosen view a score."""
+        return bool(np.isfinite(self.selected_scores).any())
 
 
 def make_rounds(acquisition: dict[str, np.ndarray]) -> list[Round]:
@@ -155,27 +148,18 @@ def make_rounds(acquisition: dict[str, np.ndarray]) -> list[Round]:
         selected = selected[selected >= 0]  # -1 fills a round that chose fewer
         candidates = np.setdiff1d(np.asarray(acquisition["pool"], int), training)
         scores = np.asarray(acquisition["scores"][i], float)
-        survives = np.asarray(acquisition["survivors"][i], bool)[candidates]
-        known = np.isfinite(scores[candidates])
-        ranked, left = scores[candidates][known], scores[candidates][known & survives]
-        choices = []
-        for view in selected:
-            scored = bool(np.isfinite(scores[view]))
-            gaps = np.linalg.norm(positions[training] - positions[view], axis=-1)
-            choices.append(
-                Choice(
-                    view_id=int(view),
-                    name=str(names[view]),
-                    score=float(scores[view]) if scored else None,
-                    rank=int((ranked > scores[view]).sum()) + 1 if scored else None,
-                    num_scored=ranked.size,
-                    rank_left=int((left > scores[view]).sum()) + 1 if scored else None,
-                    num_left=left.size,
-                    distance=float(gaps.min()) if gaps.size else float("nan"),
-                )
-            )
+        gaps = np.linalg.norm(positions[selected][:, None] - positions[training], axis=-1)
         rounds.append(
-            Round(i + 1, candidates, survives, scores[candidates], selected, tuple(choices))
+            Round(
+                number=i + 1,
+                candidates=candidates,
+                survives=np.asarray(acquisition["survivors"][i], bool)[candidates],
+                scores=scores[candidates],
+                selected=selected,
+                names=[str(names[view]) for view in selected],
+                selected_scores=scores[selected],
+                distances=gaps.min(-1) if training.size else np.full(len(selected), np.nan),
+            )
         )
         training = np.concatenate([training, selected])
     return rounds

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import numpy as np
+
 from experiments.errors import ReportError
 from experiments.reporting import stats
 from experiments.reporting.plots import PARTS
@@ -163,16 +165,17 @@ def timing_table(runs: list[Run], policies: list[str]) -> Table:
 
 def choice_table(one: Round) -> Table:
     """Why each view of a round was chosen: its score, its rank, its distance from what was held."""
-    scored = any(choice.score is not None for choice in one.choices)
-    filtered = scored and not one.survives.all()
-    head = ["view", *["score", "rank among all"] * scored, *["rank after filter"] * filtered]
+    filtered = one.is_scored and not one.survives.all()
+    head = ["view", *["score", "rank among all"] * one.is_scored]
+    head += ["rank after filter"] * filtered
+    ranked = [one.scores[np.isfinite(one.scores) & kept] for kept in (True, one.survives)]
     rows = []
-    for choice in one.choices:
-        row = [dash(f"{choice.name} was not scored")] * (len(head) - 1)
-        if choice.score is not None:
-            row = [Cell(f"{choice.score:.4g}"), Cell(f"{choice.rank} of {choice.num_scored}")]
-            row += [Cell(f"{choice.rank_left} of {choice.num_left}")] * filtered
-        rows.append((Cell(choice.name), *row, Cell(f"{choice.distance:.3g}")))
+    for name, score, distance in zip(one.names, one.selected_scores, one.distances):
+        row = [dash(f"{name} was not scored")] * (len(head) - 1)
+        if np.isfinite(score):
+            ranks = [Cell(f"{(some > score).sum() + 1} of {some.size}") for some in ranked]
+            row = [Cell(f"{score:.4g}"), *ranks[: 1 + filtered]]
+        rows.append((Cell(name), *row, Cell(f"{distance:.3g}")))
     return Table((*head, "nearest training view (scene units)"), tuple(rows))
 
 

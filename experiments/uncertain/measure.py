@@ -69,9 +69,17 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
         images, render_seconds = kept
         if name != COMMON_MODEL:
             images, render_seconds = render_model(scene, fitted, view_ids, label)
-        own, shared = (all_ause(errors, images) for errors in (errors_of(images), common_errors))
+        ause, arrays = {}, {}
+        for field, errors in (("own", errors_of(images)), ("common", common_errors)):
+            found = all_ause(errors, images)
+            ause[field] = {
+                variant: {"ause": one.ause, "unnormalised": one.ause_unnormalised}
+                for variant, one in found.items()
+            }
+            for variant, one in found.items():
+                arrays[f"{field}_{variant}_by_uncertainty"] = one.by_uncertainty
+                arrays[f"{field}_{variant}_by_error"] = one.by_error
         quality = mean_quality(scene, view_ids, images)
-        arrays = curve_arrays(own, "own") | curve_arrays(shared, "common")
         if config.num_pictures:
             shown = spread_evenly(np.arange(len(view_ids)), config.num_pictures)
             arrays |= picture_arrays(scene, view_ids, images, shown)
@@ -79,6 +87,7 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
         band, numbers, interval_seconds = _measure_intervals(
             config, scene, fitted, situation, folder, name, seed
         )
+        seconds = {"fit": fitted.seconds, "render": render_seconds, "intervals": interval_seconds}
         write_arrays(path.with_suffix(".npz"), **arrays, **band)
         row = {
             "row_version": ROW_VERSION,
@@ -89,14 +98,9 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
             "psnr": quality["psnr"],
             "ssim": quality["ssim"],
             "psnr_common": common_psnr,
-            "own": ause_numbers(own),
-            "common": ause_numbers(shared),
+            **ause,
             **numbers,
-            "seconds": {
-                "fit": fitted.seconds,
-                "render": render_seconds,
-                "intervals": interval_seconds,
-            },
+            "seconds": seconds,
             "commit": commit,
         }
         write_json(path, row)
@@ -272,23 +276,6 @@ def all_ause(errors: dict[str, list], images: list[dict]) -> dict[str, Sparsific
         name = variant_name(of=of, error=error, pooled=pooled)
         found[name] = mean_sparsification(pairs, error=error, pooled=pooled)
     return found
-
-
-def ause_numbers(found: dict[str, Sparsification]) -> dict[str, dict[str, float]]:
-    """Both areas of each variant, for a result file."""
-    return {
-        name: {"ause": one.ause, "unnormalised": one.ause_unnormalised}
-        for name, one in found.items()
-    }
-
-
-def curve_arrays(found: dict[str, Sparsification], prefix: str) -> dict[str, np.ndarray]:
-    """The curves of each variant as arrays with names."""
-    arrays = {}
-    for name, one in found.items():
-        arrays[f"{prefix}_{name}_by_uncertainty"] = one.by_uncertainty
-        arrays[f"{prefix}_{name}_by_error"] = one.by_error
-    return arrays
 
 
 def picture_arrays(scene, view_ids, images: list[dict], shown) -> dict[str, np.ndarray]:
