@@ -52,7 +52,7 @@ def result_tables(
       folder: where the result files are.
       form: a key of `FORMATS`.
       names: of the tables; None: all.
-      paper, only: a table of the paper, and the policies that are shown; see `run_tables`.
+      paper, only: a table of the paper, and the policies that are shown; see `experiment_tables`.
 
     Raises:
       ReportError: a file that cannot be used, or no such table.
