@@ -102,10 +102,9 @@ def measure_runs(measure: Callable[[TrainedRun], dict], name: str) -> None:
     """Measures the runs one after another; each is a row of the file `name` in --workdir."""
     start, path, rows = time.monotonic(), pathlib.Path(FLAGS.workdir) / name, []
     for run in trained_runs():
-        run_start = time.monotonic()
+        before = time.monotonic()
         measured = measure(run)
-        seconds = {"seconds": time.monotonic() - run_start}
-        rows.append({**about_run(run), **seconds, **measured})
+        rows.append({**about_run(run), "seconds": time.monotonic() - before, **measured})
         # Written after each run, so that a command that is stopped leaves what it has measured.
         write_json(path, result_file(run, rows))
     print(f"numbers:  {path}")

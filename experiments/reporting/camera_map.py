@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -52,7 +53,7 @@ def _axes(up: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return right, np.cross(up, right), up
 
 
-def map_plot(acquisition: dict[str, np.ndarray], rounds: list[Round], *, salt: str) -> str:
+def map_plot(acquisition: dict[str, np.ndarray], rounds: list[Round], *, salt: str) -> Markup:
     """One small map per round, with the distances below where cameras do not keep theirs.
 
     Args:

@@ -22,7 +22,7 @@ class Section(NamedTuple):
     title: str
     table: Table | None = None
     note: str = ""
-    plots: Sequence[str] = ()  # SVG
+    plots: Sequence[Markup] = ()  # from `plots.to_svg`
 
 
 def write_page(path: str | os.PathLike, *, title: str, made: dict, sections: list[Section]) -> None:
@@ -34,7 +34,6 @@ def write_page(path: str | os.PathLike, *, title: str, made: dict, sections: lis
       made: a result file: its scene, device, command and versions are shown.
       sections: from top to bottom.
     """
-    sections = [s._replace(plots=[Markup(svg) for svg in s.plots]) for s in sections]
     write_template(path, FOLDER / "sections.html", title=title, made=made, sections=sections)
 
 

@@ -8,6 +8,7 @@ import pathlib
 import re
 
 import matplotlib
+from markupsafe import Markup
 from matplotlib import patheffects
 from matplotlib import style as matplotlib_style
 from matplotlib.axes import Axes
@@ -42,8 +43,8 @@ GREY, PALE = "#6b7280", "#c3c8d0"
 DOT = {"markeredgecolor": "white"}
 
 
-def to_svg(figure: Figure, *, salt: str, label: str) -> str:
-    """A figure as an `<svg>` element that may stand in a page beside others.
+def to_svg(figure: Figure, *, salt: str, label: str) -> Markup:
+    """A figure as an `<svg>` element that may stand in a page beside others, as it is.
 
     Args:
       figure: what to draw.
@@ -60,7 +61,7 @@ def to_svg(figure: Figure, *, salt: str, label: str) -> str:
     svg = re.sub(r'<g id="[^"]*_\d+">', "<g>", svg)
     # Glyphs are defined per figure; a viewer that looks one up by id may find another figure's.
     svg = re.sub(r"(id=\"|href=\"#|url\(#)", rf"\g<1>{salt}-", svg)
-    return svg.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
+    return Markup(svg.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1))
 
 
 def save_figure(figure: Figure, path: str | os.PathLike) -> None:
@@ -182,7 +183,7 @@ def _label_ends(axes: Axes, ends: list) -> None:
     axes.set_ylim(low, high)
 
 
-def timing_plot(runs: list[Run], policies: list[str]) -> str | None:
+def timing_plot(runs: list[Run], policies: list[str]) -> Markup | None:
     """Where the time went, a stacked bar per policy, or None if nothing has been completed."""
     rows = [p for p in policies if stats.completed(runs, p)]
     if not rows:
@@ -206,7 +207,7 @@ def timing_plot(runs: list[Run], policies: list[str]) -> str | None:
     return to_svg(figure, salt="timings", label="Seconds spent per policy and part of the work")
 
 
-def gap_plot(runs: list[Run], policies: list[str], coloured: list[str]) -> str | None:
+def gap_plot(runs: list[Run], policies: list[str], coloured: list[str]) -> Markup | None:
     """PSNR of each policy minus that of random choice, seed by seed; None without random.
 
     Large dots are means with their 95 % intervals, small ones single seeds. The scale follows the

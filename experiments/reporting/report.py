@@ -7,8 +7,6 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from markupsafe import Markup
-
 from experiments.reporting import camera_map, pictures, plots, run_tables, stats
 from experiments.reporting.page import FOLDER, write_template
 from experiments.reporting.results import (
@@ -60,12 +58,9 @@ def write_report(workdir: str | os.PathLike) -> Path:
         figure = plots.quality_figure(runs, policies, measure, coloured)
         if figure is not None:
             label = f"{measure.label} against training views"
-            svg = plots.to_svg(figure, salt=f"quality-{measure.key}", label=label)
-            qualities.append(Markup(svg))
+            qualities.append(plots.to_svg(figure, salt=f"quality-{measure.key}", label=label))
         elif runs:
             missing.append(run_tables.missing_measure(measure, runs))
-    gaps = plots.gap_plot(runs, policies, coloured)
-    timing = plots.timing_plot(runs, policies)
     limits, strips = _strips(by_policy)
     configs: dict[str, list[str]] = {}
     versions: dict[str, set[str]] = {}
@@ -86,7 +81,7 @@ def write_report(workdir: str | os.PathLike) -> Path:
         headline=make_headline(runs, policies),
         tiles=[(p, colours[p][0], psnr) for p, psnr in finals.items() if psnr is not None],
         num_grey=len(policies) - len(coloured),
-        gaps=gaps and Markup(gaps),
+        gaps=plots.gap_plot(runs, policies, coloured),
         incomplete=[run.label for run in runs if not run.completed],
         qualities=qualities,
         missing=missing,
@@ -97,7 +92,7 @@ def write_report(workdir: str | os.PathLike) -> Path:
         bars=pictures.colour_bars(limits) if strips else [],
         maps=_maps(by_policy),
         bound_words=bound_words,
-        timing=timing and Markup(timing),
+        timing=plots.timing_plot(runs, policies),
         timing_table=run_tables.timing_table(runs, policies),
         versions=versions,
         configs=configs,
@@ -128,7 +123,7 @@ def _maps(by_policy: dict[str, list[Run]]) -> dict[str, tuple]:
                 rounds = make_rounds(acquisition)
                 svg = camera_map.map_plot(acquisition, rounds, salt=f"map{number}-{place}")
                 tables = [(one, run_tables.choice_table(one)) for one in rounds]
-                maps[run.label] = Markup(svg), tables
+                maps[run.label] = svg, tables
     return maps
 
 

@@ -64,17 +64,15 @@ def write_page(path: pathlib.Path, result: dict, *, arrays: dict, variant: str) 
         result=result,
         variant=variant,
         summary=summary_table(rows),
-        plots=[Markup(curve_plot(arrays, field, variant)) for field in FIELDS],
+        plots=[curve_plot(arrays, field, variant) for field in FIELDS],
         variants=[(name, ause_table(rows, name)) for name in variants],
         split=split_words(result),
         coverage=[coverage_table(rows, quantity) for quantity in known_quantities(rows)],
-        coverage_plots=[
-            Markup(plot) for plot in (coverage_plot(rows), width_plot(rows), decile_plot(rows))
-        ],
+        coverage_plots=[coverage_plot(rows), width_plot(rows), decile_plot(rows)],
         left_out=_left_out_words(rows),
         shown=shown,
         band=band_strip(pictures[shown]),
-        scanline=Markup(scanline_plot(pictures[shown], shown)),
+        scanline=scanline_plot(pictures[shown], shown),
         strips=[strip for model in pictures for strip in view_strips(model, pictures[model])],
     )
 
@@ -115,7 +113,7 @@ def _left_out_words(rows: list[dict]) -> str:
 # --- sparsification and coverage ---
 
 
-def curve_plot(curves: dict[str, list[dict]], field: str, variant: str) -> str:
+def curve_plot(curves: dict[str, list[dict]], field: str, variant: str) -> Markup:
     """Error of the pixels that are left, for each model, against what is taken away.
 
     Args:
@@ -156,7 +154,7 @@ def mean_curves(arrays: list[dict], field: str, variant: str) -> tuple[np.ndarra
     return tuple(np.mean(curves, axis=0) for curves in zip(*pairs))
 
 
-def coverage_plot(rows: list[dict]) -> str:
+def coverage_plot(rows: list[dict]) -> Markup:
     """Coverage less the nominal level, with two standard errors over test views; a panel each."""
     figure, panels = _panels(rows, 1, 0.0)
     for axes, quantity in zip(panels[0], known_quantities(rows)):
@@ -179,7 +177,7 @@ def coverage_plot(rows: list[dict]) -> str:
     )
 
 
-def width_plot(rows: list[dict]) -> str:
+def width_plot(rows: list[dict]) -> Markup:
     """Mean width and interval score as shares of those of one width for all pixels."""
     figure, panels = _panels(rows, 2, 1.0)
     names = (("width_ratio", "mean width"), ("score_ratio", "interval score"))
@@ -198,7 +196,7 @@ def width_plot(rows: list[dict]) -> str:
     return _finish(figure, panels, "nominal level", "width", "Widths and interval scores")
 
 
-def decile_plot(rows: list[dict]) -> str:
+def decile_plot(rows: list[dict]) -> Markup:
     """Coverage at `LEVEL` in each tenth of the pixels, from the least uncertain up."""
     figure, panels = _panels(rows, 1, 100.0 * LEVEL)
     style, tenths = plots.policy_style(models_of(rows)), np.arange(1, 11)
@@ -245,7 +243,7 @@ def _level_axis(axes, levels) -> None:
     axes.set_xlim(-0.5, len(levels) - 0.5)
 
 
-def _finish(figure: Figure, panels, xlabel: str, salt: str, label: str) -> str:
+def _finish(figure: Figure, panels, xlabel: str, salt: str, label: str) -> Markup:
     """One legend for all panels, and what is below the last of them."""
     for axes in panels[-1]:
         axes.set_xlabel(xlabel)
@@ -287,7 +285,7 @@ def band_strip(arrays: dict[str, np.ndarray]) -> dict:
     return {"name": str(arrays["band_name"]), "quantity": quantity, "images": images}
 
 
-def scanline_plot(arrays: dict[str, np.ndarray], model: str) -> str:
+def scanline_plot(arrays: dict[str, np.ndarray], model: str) -> Markup:
     """The image row with the most known pixels: render, band and truth along it."""
     value, half, truth = (arrays[f"band_{name}"] for name in ("value", "half", "truth"))
     known = np.isfinite(value) & np.isfinite(truth)
