@@ -17,7 +17,7 @@ setup(
     license="Apache-2.0",
     python_requires=">=3.11",
     packages=find_packages(include=["bavs_jax", "bavs_jax.*", "experiments", "experiments.*"]),
-    package_data={"experiments": ["*/*.html"]},
+    package_data={"experiments": ["*/*.html", "*/*.mplstyle"]},
     install_requires=[
         "absl-py>=2.1",
         "flax>=0.12",

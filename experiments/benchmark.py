@@ -20,7 +20,7 @@ from experiments.bench.measure import benchmark
 from experiments.bench.results import BENCHMARK, benchmark_tables
 from experiments.bench.subject import check_sizes, default_sizes
 from experiments.configs import base
-from experiments.report.collected import collected_text
+from experiments.reporting.tables import collected_text
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS

@@ -22,8 +22,7 @@ from experiments import compilation, runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import check_views, load_config_scene
 from experiments.schema import given_config
-from experiments.uncertain.one_seed import measure_seed
-from experiments.uncertain.summary import write_summary
+from experiments.uncertain.measure import measure_seed, write_summary
 
 FLAGS = flags.FLAGS
 flags.adopt_module_key_flags(compilation)

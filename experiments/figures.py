@@ -8,13 +8,10 @@ with their uncertainty (Figure 8: views.pdf), from the result files alone.
 
 from __future__ import annotations
 
-import sys
-
 from absl import flags
 
 from experiments import runtime
-from experiments.report import ReportError
-from experiments.report.figure_files import FORMATS, write_figures
+from experiments.reporting.pictures import FORMATS, write_figures
 
 FLAGS = flags.FLAGS
 flags.DEFINE_string("workdir", None, "Folder of experiments.active_selection, with summary.json.")
@@ -28,11 +25,8 @@ flags.DEFINE_integer(
 def main() -> None:
     folder = runtime.given_folder("workdir", "the folder of an experiment", exists=True)
     options = {"form": FLAGS.format, "policies": FLAGS.policy, "num_views": FLAGS.num_views}
-    try:
-        for path in write_figures(folder, **options):
-            print(path)
-    except ReportError as error:
-        sys.exit(f"error: {error}")
+    for path in write_figures(folder, **options):
+        print(path)
 
 
 if __name__ == "__main__":

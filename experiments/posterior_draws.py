@@ -10,15 +10,11 @@ views and in test views, and WORKDIR/<policy>/seed_<n>/draws/draws.png shows it.
 
 from __future__ import annotations
 
-import pathlib
-import time
-
 import numpy as np
 from absl import flags
 from matplotlib.figure import Figure
 
 from experiments.evaluate import spread_evenly
-from experiments.files import write_json
 from experiments.posthoc import script
 from experiments.posthoc.draws import (
     ViewDraws,
@@ -27,8 +23,9 @@ from experiments.posthoc.draws import (
     largest_offset,
     spread_measures,
 )
-from experiments.posthoc.tables import SPLITS
-from experiments.report.panels import Panel, panel_table, save_figure
+from experiments.reporting.pictures import Panel, panel_table
+from experiments.reporting.plots import save_figure
+from experiments.reporting.result_tables import SPLITS
 from experiments.trained import TrainedRun
 
 NUM_SHOWN = 3  # draws in the picture
@@ -50,27 +47,17 @@ flags.DEFINE_float(
 
 def draw_all() -> None:
     """Draws, renders, measures and writes, run by run."""
-    start = time.monotonic()
     script.check_flags(
         ("num_draws", 2 <= FLAGS.num_draws <= 1024, "give a number from 2 to 1024"),
         ("num_views", FLAGS.num_views >= 1, "give 1 or more"),
         ("scale", 0.0 <= FLAGS.scale <= 1e9, "give a number above 0, or 0 for the noise's own"),
         ("limit", 0.0 < FLAGS.limit <= 1e6, "give a number above 0, up to 1e6"),
     )
-    rows = []
-    for run in script.trained_runs():
-        rows.append(draw_run(run))
-        for name, words in SPLITS.items():
-            print(f"{words}: {_in_words(rows[-1][name])}")
-        # Written after each run, so that a command that is stopped leaves what it has measured.
-        write_json(pathlib.Path(FLAGS.workdir) / "draws.json", script.result_file(run, rows))
-    print(f"numbers:  {pathlib.Path(FLAGS.workdir) / 'draws.json'}")
-    print(f"({time.monotonic() - start:.0f} s in all)")
+    script.measure_runs(draw_run, "draws.json")
 
 
 def draw_run(run: TrainedRun) -> dict:
     """One run's numbers; writes its picture."""
-    start = time.monotonic()
     test = run.problem.scene.test
     far = farthest_view(run, test)
     seen = spread_evenly(run.training_views, FLAGS.num_views)
@@ -88,12 +75,13 @@ def draw_run(run: TrainedRun) -> dict:
     path = run.folder / "draws" / "draws.png"
     save_figure(draws_figure(run, shown), path)
     print(f"picture:  {path}")
+    measures = {name: spread_measures(part) for name, part in split.items()}
+    for name, words in SPLITS.items():
+        print(f"{words}: {_in_words(measures[name])}")
     return {
-        **script.about_run(run),
-        "seconds": time.monotonic() - start,
         "options": {"num_draws": FLAGS.num_draws, "scale": scale, "limit": FLAGS.limit},
         "farthest_test_view": far,
-        **{name: spread_measures(part) for name, part in split.items()},
+        **measures,
     }
 
 

@@ -13,7 +13,7 @@ from absl import flags
 
 from bavs_jax.metrics.perceptual import NETS
 from experiments import compilation, runtime
-from experiments.posthoc.measures import Wanted, remeasure
+from experiments.posthoc.lpips import remeasure
 
 FLAGS = flags.FLAGS
 flags.adopt_module_key_flags(compilation)
@@ -26,8 +26,8 @@ flags.DEFINE_string("data_dir", "", "Folder of scenes, if it has moved since the
 def main() -> None:
     folder = runtime.given_folder("workdir", "the folder of an experiment", exists=True)
     compilation.start_cache()
-    wanted = Wanted(FLAGS.lpips_net, FLAGS.policy, FLAGS.data_dir)
-    remeasure(folder, wanted, runtime.command_line())
+    options = {"policies": FLAGS.policy, "data_dir": FLAGS.data_dir}
+    remeasure(folder, runtime.command_line(), lpips_net=FLAGS.lpips_net, **options)
 
 
 if __name__ == "__main__":

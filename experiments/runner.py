@@ -32,7 +32,7 @@ from experiments.keys import run_key, stream_key
 from experiments.machine import device_name, peak_memory_mb, versions
 from experiments.parts import Part, is_completed, is_finished
 from experiments.progress import track
-from experiments.report.choices import bound_words
+from experiments.reporting.results import bound_words
 from experiments.runtime import warn
 from experiments.signals import as_first_process, is_first_process
 

@@ -12,7 +12,7 @@ from experiments.build import build_problem
 from experiments.build_scene import check_views, load_config_scene
 from experiments.files import exclusive
 from experiments.parts import all_parts, find_part
-from experiments.report import write_report
+from experiments.reporting.report import write_report
 from experiments.runner import Run
 from experiments.signals import is_first_process
 

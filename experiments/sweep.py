@@ -18,7 +18,7 @@ from absl import flags
 from ml_collections import config_flags
 
 from experiments import compilation, runtime, workdir
-from experiments.report import write_report
+from experiments.reporting.report import write_report
 from experiments.schema import check_config, given_config
 from experiments.sweeps import capacity
 from experiments.sweeps.axes import parse_axes

@@ -20,12 +20,10 @@ from collections.abc import Sequence
 from absl import flags
 
 from experiments import runtime
-from experiments.errors import WorkdirError
+from experiments.errors import ReportError
 from experiments.files import write_atomic
-from experiments.report import ReportError
-from experiments.report.collected import collected_text
-from experiments.report.formats import FORMATS
-from experiments.result_files import collect_all
+from experiments.reporting.result_tables import collect_all
+from experiments.reporting.tables import FORMATS, collected_text
 
 FLAGS = flags.FLAGS
 flags.DEFINE_string("workdir", None, "Folder of an experiment or of a sweep: print its tables.")
@@ -54,7 +52,7 @@ def result_tables(
       folder: where the result files are.
       form: a key of `FORMATS`.
       names: of the tables; None: all.
-      paper, only: a table of the paper, and the policies that are shown; see `run_tables`.
+      paper, only: a table of the paper, and the policies that are shown; see `experiment_tables`.
 
     Raises:
       ReportError: a file that cannot be used, or no such table.
@@ -73,16 +71,14 @@ def fill_page(text: str, root: pathlib.Path) -> str:
     def filled(match: re.Match) -> str:
         head, folder, options, end = match.groups()
         given = dict(option.split("=", 1) for option in options.split())
-        names = given.pop("tables", None)
-        paper, only = given.pop("paper", None), given.pop("policies", None)
+        names, only = (given.pop(name, "").split(",") for name in ("tables", "policies"))
+        paper = given.pop("paper", None)
         if given:
             raise ReportError(
                 f"results: {folder}: {next(iter(given))}= is not tables=, policies= or paper="
             )
-        names, only = (text.split(",") if text else None for text in (names, only))
-        return (
-            f"{head}{result_tables(root / folder, names=names, paper=paper, only=only or ())}{end}"
-        )
+        shown = {"names": list(filter(None, names)), "only": list(filter(None, only))}
+        return f"{head}{result_tables(root / folder, paper=paper, **shown)}{end}"
 
     return MARKED.sub(filled, text)
 
@@ -90,18 +86,14 @@ def fill_page(text: str, root: pathlib.Path) -> str:
 def main() -> None:
     if bool(FLAGS.workdir) == bool(FLAGS.page):
         sys.exit("error: give either --workdir or --page")
-    try:
-        if FLAGS.workdir:
-            folder = runtime.given_folder("workdir", "the folder of an experiment", exists=True)
-            names = FLAGS.tables
-            options = {"names": names, "paper": FLAGS.paper, "only": FLAGS.policies or ()}
-            print(result_tables(folder, form=FLAGS.format, **options))
-            return
-        page = pathlib.Path(FLAGS.page)
-        text = fill_page(page.read_text(encoding="utf-8"), page.parent)
-        write_atomic(page, lambda file: file.write(text.encode()))
-    except (ReportError, WorkdirError, OSError) as error:
-        sys.exit(f"error: {error}")
+    if FLAGS.workdir:
+        folder = runtime.given_folder("workdir", "the folder of an experiment", exists=True)
+        options = {"names": FLAGS.tables, "paper": FLAGS.paper, "only": FLAGS.policies or ()}
+        print(result_tables(folder, form=FLAGS.format, **options))
+        return
+    page = pathlib.Path(FLAGS.page)
+    text = fill_page(page.read_text(encoding="utf-8"), page.parent)
+    write_atomic(page, lambda file: file.write(text.encode()))
 
 
 if __name__ == "__main__":

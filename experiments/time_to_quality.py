@@ -32,7 +32,7 @@ from experiments.configs import base
 from experiments.errors import ConfigError
 from experiments.files import write_json
 from experiments.machine import versions
-from experiments.report.collected import collected_text
+from experiments.reporting.tables import collected_text
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS

@@ -33,7 +33,7 @@ WORK = {
     "experiments.export_field": ("script.trained_runs",),
     "experiments.clean_up": ("script.trained_runs",),
     "experiments.posterior_draws": ("script.trained_runs",),
-    "experiments.report.__main__": ("write_report",),
+    "experiments.report": ("write_report",),
 }
 
 

@@ -26,7 +26,7 @@ from experiments.bench.timing import (
 )
 from experiments.bench.work import selection_work, slot_width
 from experiments.build_scene import load_config_scene
-from experiments.report.collected import collected_text
+from experiments.reporting.tables import collected_text
 from tests.toy_runs import toy_config
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

@@ -65,7 +65,7 @@ def test_a_device_that_computes_something_else_is_found_out(monkeypatch):
 
 
 def test_table_of_a_file_names_device_and_precision(tmp_path):
-    from experiments.result_files import collect_all
+    from experiments.reporting.result_tables import collect_all
 
     result = {
         "schema_version": 1,

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from bavs_jax.metrics.ause import sparsification
+from experiments.reporting.uncertainty import mean_curves
 from experiments.uncertain import measure
-from experiments.uncertain.files import calibration_path, load_calibration
-from experiments.uncertain.results import mean_curves, row_path
+from experiments.uncertain.intervals import calibration_path, load_calibration
+from experiments.uncertain.measure import row_path
 from tests.toy_runs import toy_flags
 from tests.toy_scenes import toy_scene
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from experiments.errors import ReportError
 from experiments.files import write_arrays
-from experiments.report import ReportError
-from experiments.report.figure_files import views_figure, write_figures
-from experiments.report.results import load_pictures, load_runs
+from experiments.reporting.pictures import views_figure, write_figures
+from experiments.reporting.results import load_pictures, load_runs
 from tests.report_files import make_pictures, make_result, write_workdir
 
 
@@ -59,7 +59,7 @@ def test_pictures_come_from_a_seed_that_all_policies_have(workdir, monkeypatch):
             write_arrays(run.folder / "pictures.npz", **make_pictures(run.seed))
     shown = {}
     monkeypatch.setattr(
-        "experiments.report.figure_files.views_figure", lambda pictures, _: shown.update(pictures)
+        "experiments.reporting.pictures.views_figure", lambda pictures, _: shown.update(pictures)
     )
     write_figures(workdir, policies=["bavs", "random"], num_views=1)
     wanted = next(r for r in load_runs(workdir) if (r.policy, r.seed) == ("random", 1))

@@ -24,8 +24,8 @@ from bavs_jax.uncertainty.model import Situation
 from experiments.build import build_problem
 from experiments.build_trainer import train_aside
 from experiments.progress import track
-from experiments.report.results import Run
-from experiments.report.tables import final_table
+from experiments.reporting.results import Run
+from experiments.reporting.run_tables import final_table
 from experiments.suggest.training import train_field
 from tests.toy_rounds import run_round
 from tests.toy_runs import toy_config

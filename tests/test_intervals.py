@@ -9,15 +9,18 @@ import pytest
 from bavs_jax.uncertainty.bands import add_bands
 from bavs_jax.uncertainty.conformal_scale import ViewGroups
 from experiments.errors import ConfigError, WorkdirError
-from experiments.uncertain.files import load_calibration, load_images, save_calibration, save_images
+from experiments.reporting.uncertainty import band_strip, scanline_plot
 from experiments.uncertain.intervals import (
     ViewSample,
+    band_arrays,
     calibrate_samples,
     interval_views,
+    load_calibration,
     sample_views,
+    save_calibration,
     split,
 )
-from experiments.uncertain.plots import band_arrays, band_strip, scanline_plot
+from experiments.uncertain.measure import load_images, save_images
 from tests.toy_scenes import toy_scene
 
 SIZE = 6
@@ -187,5 +190,5 @@ def test_picture_shows_where_the_truth_is_outside(has_depth):
     outside = np.abs(arrays["band_value"] - arrays["band_truth"]) > arrays["band_half"]
     assert outside[0].all() and not outside[1:].any() and np.isnan(arrays["band_half"][1, 1])
     strip = band_strip(arrays)
-    assert len(strip["images"]) == 4 and "blue, 82.9%" in strip["images"][3][0]  # 29 of 35
+    assert len(strip["images"]) == 4 and "blue, 82.9%" in strip["images"][3].caption  # 29 of 35
     assert scanline_plot(arrays, "laplace").startswith("<svg ")

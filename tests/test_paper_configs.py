@@ -14,7 +14,7 @@ import pytest
 from bavs_jax.selection.policies import POLICIES
 from experiments.build import build_problem
 from experiments.configs.paper import table_3
-from experiments.report.paper_table import TABLES
+from experiments.reporting.run_tables import PAPER
 from tests.scene_files import write_nerfstudio
 from tests.toy_runs import OVERRIDES
 from tests.toy_scenes import toy_scene
@@ -57,7 +57,7 @@ def test_the_protocols_are_the_printed_ones():
     assert tables["table_1"].train.num_steps == 40_000
     assert tables["figure_7"].train.num_steps * (tables["figure_7"].num_rounds + 1) == 30_000
     assert (tables["table_2"].load.pool_size, tables["table_4"].load.pool_size) == (200.0, 300.0)
-    for name, rows in TABLES.items():
+    for name, rows in PAPER.items():
         assert {row.policy for row in rows if row.policy} <= set(tables[name].policies)
 
 

@@ -10,10 +10,10 @@ from bavs_jax.scenes import load_nerfstudio
 from experiments.evaluate import picture_arrays
 from experiments.files import write_arrays
 from experiments.picture_stack import cut_pictures
-from experiments.report import pictures
-from experiments.report.results import load_pictures, load_runs
+from experiments.reporting import pictures
+from experiments.reporting.results import load_pictures, load_runs
+from experiments.reporting.uncertainty import view_strips
 from experiments.uncertain import measure
-from experiments.uncertain.page import _strips
 from tests.report_files import make_result, write_workdir
 from tests.scene_files import random_image, write_nerfstudio
 
@@ -49,8 +49,8 @@ def test_a_report_shows_each_view_at_its_own_size(scene, tmp_path):
             assert (found[name][i] > 0.0).any()
     strips = pictures.strips(found, pictures.uncertainty_limits([found]), max_side=100)
     words = pictures.psnr_words(found["rgb"][1], scene.image(3))
-    assert [strip.name for strip in strips] == [scene.names[view] for view in VIEWS]
-    assert words in strips[1].pictures[1].caption
+    assert list(strips) == [scene.names[view] for view in VIEWS]
+    assert words in strips[scene.names[3]][1].caption
 
 
 def test_the_page_of_uncertainties_shows_each_view_at_its_own_size(scene):
@@ -62,7 +62,7 @@ def test_the_page_of_uncertainties_shows_each_view_at_its_own_size(scene):
     assert arrays["truth"].shape == (3, 8, 12, 3)
     cut = cut_pictures(arrays)
     assert [image.shape for image in cut["rgb"]] == shapes
-    assert len(_strips({"model": cut})) == 3
+    assert len(view_strips("model", cut)) == 3
 
 
 def test_pictures_of_one_size_stay_arrays(scene):

@@ -13,8 +13,8 @@ import pytest
 
 from bavs_jax.selection.policies import POLICIES
 from experiments.errors import ConfigError, WorkdirError
-from experiments.posthoc.measures import Wanted, remeasure
-from experiments.report.collected import collect_tables
+from experiments.posthoc.lpips import remeasure
+from experiments.reporting.result_tables import collect_tables
 from tests.toy_runs import toy_flags
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -171,7 +171,7 @@ def test_another_config_in_the_same_folder_is_refused(finished):
 @pytest.mark.usefixtures("quick_compilation")
 def test_lpips_is_added_to_finished_runs(unmeasured, capsys):
     before = {policy: load(unmeasured, policy) for policy in ("bavs", "random")}
-    remeasure(unmeasured, Wanted(policies=["random"]), "later")
+    remeasure(unmeasured, "later", policies=["random"])
     assert load(unmeasured) == before["bavs"]
     after = load(unmeasured, "random")
     *earlier, last = after["rounds"]
@@ -181,7 +181,7 @@ def test_lpips_is_added_to_finished_runs(unmeasured, capsys):
     summary = json.loads((unmeasured / "summary.json").read_text())
     assert summary["runs"] == [before["bavs"], after]
     assert collect_tables(unmeasured).made.count("`, then `later`") == 1
-    remeasure(unmeasured, Wanted(policies=["random"]), "once more")
+    remeasure(unmeasured, "once more", policies=["random"])
     assert load(unmeasured, "random") == after
     assert "nothing is left to measure" in capsys.readouterr().out
 
@@ -193,13 +193,13 @@ def test_remeasuring_notices_another_scene_and_a_missing_run(unmeasured):
     result["rounds"][-1]["psnr"] += 0.5
     path.write_text(json.dumps(result))
     with pytest.raises(WorkdirError, match=r"psnr: the run had .* dB, its checkpoint has"):
-        remeasure(unmeasured, Wanted(policies=["random"]), "later")
+        remeasure(unmeasured, "later", policies=["random"])
     assert load(unmeasured, "random") == result
     with pytest.raises(ConfigError, match=r"--policy: warp: .* holds no finished run of it"):
-        remeasure(unmeasured, Wanted(policies=["warp"]), "later")
+        remeasure(unmeasured, "later", policies=["warp"])
 
 
 def test_remeasuring_without_the_package_says_what_to_install(unmeasured, monkeypatch):
     monkeypatch.setattr("experiments.build.make_lpips_fn", lambda net: (None, "install it"))
     with pytest.raises(ConfigError, match="--lpips_net: install it"):
-        remeasure(unmeasured, Wanted(), "later")
+        remeasure(unmeasured, "later")

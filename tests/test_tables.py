@@ -11,14 +11,26 @@ import numpy as np
 import pytest
 from scipy import stats as scipy_stats
 
-from experiments.posthoc.tables import cleanup_table, draws_table, geometry_table
-from experiments.report import ReportError, stats
-from experiments.report.collected import collect_tables, run_tables
-from experiments.report.formats import comma_separated, latex, markdown
-from experiments.report.paper_table import TABLES
-from experiments.report.results import load_runs
-from experiments.report.stats import mean_runs
-from experiments.report.tables import Cell, Table, interval_cell
+from experiments.errors import ReportError
+from experiments.reporting import stats
+from experiments.reporting.result_tables import (
+    cleanup_table,
+    collect_tables,
+    draws_table,
+    experiment_tables,
+    geometry_table,
+)
+from experiments.reporting.results import load_runs
+from experiments.reporting.run_tables import PAPER
+from experiments.reporting.stats import mean_runs
+from experiments.reporting.tables import (
+    Cell,
+    Table,
+    comma_separated,
+    interval_cell,
+    latex,
+    markdown,
+)
 from experiments.sweeps.record import Record, write_record
 from experiments.tables import MARKED, fill_page, result_tables
 from tests.report_files import make_result, write_workdir
@@ -136,7 +148,7 @@ def test_p_of_one_seed_and_of_equal_gaps():
 def test_the_papers_rows_stand_beside_ours(workdir):
     table = collect_tables(workdir, "table_1").tables["paper"]
     rows = {row[0].text: dict(zip(table.head, row)) for row in table.rows}
-    assert [row[1].text for row in table.rows[:5]] == [row.name for row in TABLES["table_1"]]
+    assert [row[1].text for row in table.rows[:5]] == [row.name for row in PAPER["table_1"]]
     assert rows["bavs"]["PSNR (dB)"].text.startswith(f"{final_psnr('bavs').mean():.2f} ± ")
     texts = [cell.text for cell in table.rows[4]]
     assert texts[3] == "29.02" and texts[-1] == "+1.88"  # 29.023 - 27.138, as a float
@@ -275,7 +287,8 @@ def test_a_sweep_over_scenes_has_their_mean_and_the_papers_rows(tmp_path):
     assert found.tables["settings"].head[-1] == "PSNR gap to random (dB)"
     assert found.notes[0] == "Tables after the first are of means over these 2 scenes."
     rows = {row[0].text: row for row in found.tables["quality"].rows}
-    one = {row[0].text: row for row in run_tables(tmp_path / "scene=lego").tables["quality"].rows}
+    of_lego = experiment_tables(tmp_path / "scene=lego").tables["quality"]
+    one = {row[0].text: row for row in of_lego.rows}
     assert (rows["random"][1].text, rows["bavs"][1].text) == ("3", "2")  # seeds that all have
     level, alone = (float(r["random"][3].text.split()[0]) for r in (rows, one))
     assert level == pytest.approx(alone + 1.0, abs=0.011)

@@ -4,17 +4,20 @@ import copy
 
 import pytest
 
-from experiments.report import ReportError
-from experiments.report.tables import Table
-from experiments.tables import result_tables
-from experiments.uncertain.results import (
+from experiments.errors import ReportError
+from experiments.reporting.tables import Table
+from experiments.reporting.uncertainty import title
+from experiments.reporting.uncertainty_tables import (
+    CONSTANT,
     SCHEMA_VERSION,
+    ause_table,
+    coverage_table,
     known_variants,
     load_result,
     save_result,
-    title,
+    summary_table,
 )
-from experiments.uncertain.tables import CONSTANT, ause_table, coverage_table, summary_table
+from experiments.tables import result_tables
 
 LEVELS = [0.5, 0.9, 0.95]
 

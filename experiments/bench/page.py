@@ -18,9 +18,9 @@ from experiments.bench.results import (
     quality_table,
     stage_table,
 )
-from experiments.report import plots
-from experiments.report.tables import Table
-from experiments.web.page import write_template
+from experiments.reporting import plots
+from experiments.reporting.page import write_template
+from experiments.reporting.tables import Table
 
 
 def growth_plot(name: str, row: dict) -> str:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import pathlib
 
-from experiments.report.collected import Collected
-from experiments.report.plots import seconds
-from experiments.report.results import read_result
-from experiments.report.tables import Cell, Table, dash
+from experiments.reporting.results import read_result
+from experiments.reporting.tables import Cell, Collected, Table, dash, seconds
 
 BENCHMARK, QUALITY = "benchmark.json", "time_to_quality.json"
 STAGES = {

@@ -22,7 +22,7 @@ from experiments.build import RENDER_CHUNK, build_problem
 from experiments.build_scene import initial_views, load_config_scene
 from experiments.configs import base
 from experiments.keys import run_key, stream_key
-from experiments.report.tables import Cell, Table, dash
+from experiments.reporting.tables import Cell, Table, dash
 
 DEVICE_FILE = "check_device.json"
 

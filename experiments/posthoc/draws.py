@@ -93,24 +93,18 @@ def draw_views(
             draw_key = jax.random.fold_in(key, draw)
             (theta,) = draw_offsets(draw_key, precision, 1, scale=scale, limit=jnp.asarray(limit))
             moved = partial(displaced, train.model, theta)
+
+            def render_rgb(rays, moved=moved):
+                return {"rgb": moved(rays)["rgb"]}
+
             rendered = render_views(
-                lambda rays, fn=moved: {"rgb": fn(rays)["rgb"]},
-                cameras,
-                view_ids,
-                chunk=RENDER_CHUNK,
-                progress_fn=bar.advance,
+                render_rgb, cameras, view_ids, chunk=RENDER_CHUNK, progress_fn=bar.advance
             )
             by_draw.append([image["rgb"] for image in rendered])
-    views = [
-        ViewDraws(
-            int(v),
-            image["rgb"],
-            image["opacity"],
-            image["uncertainty"],
-            draws=np.stack([draw[i] for draw in by_draw]),
-        )
-        for i, (v, image) in enumerate(zip(view_ids, images))
-    ]
+    views = []
+    for view, image, draws in zip(view_ids, images, zip(*by_draw)):
+        shown = (image[name] for name in ("rgb", "opacity", "uncertainty"))
+        views.append(ViewDraws(int(view), *shown, np.stack(draws)))
     return views, scale
 
 

@@ -6,6 +6,8 @@ checkpoints in --workdir are taken up as they are.
 
 from __future__ import annotations
 
+import pathlib
+import time
 from collections.abc import Callable, Iterator
 
 from absl import flags
@@ -15,6 +17,7 @@ from experiments import compilation, runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import check_views, load_config_scene
 from experiments.errors import ConfigError
+from experiments.files import write_json
 from experiments.machine import device_name, versions
 from experiments.schema import MAX_SEED, given_config
 from experiments.trained import (
@@ -65,12 +68,8 @@ def trained_runs() -> Iterator[TrainedRun]:
       ConfigError, WorkdirError, SceneError: flags, folder or scene cannot be used.
     """
     folder, config = runtime.given_folder("workdir", "the folder of a run"), given_config()
-    if config is None:
-        saved = saved_config(folder)
-        chosen = choose_runs(folder, saved, FLAGS.policy, FLAGS.seed)
-        config, take_up = saved, load_run
-        config.data_dir = FLAGS.data_dir or config.data_dir
-    else:
+    is_new = config is not None
+    if is_new:
         if FLAGS.data_dir:
             raise ConfigError("--data_dir: with --config, give --config.data_dir in its place")
         # A config without rounds ends where all policies begin.
@@ -78,22 +77,38 @@ def trained_runs() -> Iterator[TrainedRun]:
         field_kind(policy)  # an unknown policy ends here, before anything is written
         workdir.check_claim(folder, config)
         seeds = config.seeds if FLAGS.seed is None else (FLAGS.seed,)
-        chosen, take_up = [(policy, seed) for seed in seeds], _train_run
+        chosen = [(policy, seed) for seed in seeds]
+    else:
+        config = saved_config(folder)
+        chosen = choose_runs(folder, config, FLAGS.policy, FLAGS.seed)
+        config.data_dir = FLAGS.data_dir or config.data_dir
     scene = load_config_scene(config, cache_dir=runtime.scene_cache())
-    if take_up is _train_run:
+    if is_new:
         check_views(config, scene)
     problem = build_problem(config, scene, field_kind(chosen[0][0]))
-    if take_up is _train_run:
+    if is_new:
         workdir.claim(folder, config)
     for policy, seed in chosen:
-        run = take_up(config, problem, folder, policy, seed)
+        if is_new:
+            run = train_run(config, problem, folder, policy, seed, runtime.command_line())
+        else:
+            run = load_run(config, problem, folder, policy, seed)
         state = "the end of" if run.completed else "the last checkpoint of"
         print(f"{scene.name}: {state} {run.label}, {len(run.training_views)} training views")
         yield run
 
 
-def _train_run(*args) -> TrainedRun:
-    return train_run(*args, command=runtime.command_line())
+def measure_runs(measure: Callable[[TrainedRun], dict], name: str) -> None:
+    """Measures the runs one after another; each is a row of the file `name` in --workdir."""
+    start, path, rows = time.monotonic(), pathlib.Path(FLAGS.workdir) / name, []
+    for run in trained_runs():
+        before = time.monotonic()
+        measured = measure(run)
+        rows.append({**about_run(run), "seconds": time.monotonic() - before, **measured})
+        # Written after each run, so that a command that is stopped leaves what it has measured.
+        write_json(path, result_file(run, rows))
+    print(f"numbers:  {path}")
+    print(f"({time.monotonic() - start:.0f} s in all)")
 
 
 def about_run(run: TrainedRun) -> dict:

@@ -7,14 +7,14 @@ import pathlib
 import numpy as np
 from markupsafe import Markup
 
-from experiments.report.pictures import (
+from experiments.reporting.page import write_template
+from experiments.reporting.pictures import (
     UNCERTAINTY_MAP,
     colourise,
     png_uri,
     shrink,
     uncertainty_limits,
 )
-from experiments.web.page import write_template
 
 MAX_SIDE = 300  # pixels of a preview
 

@@ -11,8 +11,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from bavs_jax.selection.worth import Worth
-from experiments.report import plots
-from experiments.report.camera_map import SCORE_MAP
+from experiments.reporting import plots
+from experiments.reporting.camera_map import SCORE_MAP
 
 PHOTO = "#6b7280"
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from bavs_jax.placement.collect import Proposals
 from bavs_jax.selection.worth import Worth
-from experiments.report.tables import Cell, Table, dash
+from experiments.reporting.tables import Cell, Table, dash
 from experiments.suggest.choosing import Suggestion
 from experiments.suggest.facts import length
 from experiments.suggest.places import Surroundings

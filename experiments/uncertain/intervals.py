@@ -1,8 +1,12 @@
-"""Calibrated intervals of one uncertainty model: which views and pixels, and how well they hold."""
+"""Calibrated intervals of one uncertainty model: of which views and pixels, and how well they hold.
+
+A calibration is kept in a file of its own, so that it can be put around renders of new views.
+"""
 
 from __future__ import annotations
 
 import itertools
+import pathlib
 import time
 from typing import NamedTuple
 
@@ -13,18 +17,24 @@ from bavs_jax.rendering.images import render_pixels
 from bavs_jax.uncertainty.bands import (
     QUANTITIES,
     RenderCalibration,
+    add_bands,
     band_errors,
     calibrate_renders,
+    calibration_from_json,
+    calibration_to_json,
     has_band,
     render_errors,
 )
 from bavs_jax.uncertainty.conformal_report import coverage_report, to_json
 from bavs_jax.uncertainty.conformal_scale import ViewErrors, ViewGroups, split_views
 from experiments.build import RENDER_CHUNK
-from experiments.errors import ConfigError
+from experiments.errors import ConfigError, WorkdirError
 from experiments.evaluate import spread_evenly
+from experiments.files import read_versioned, write_json
 from experiments.progress import track
+from experiments.reporting.uncertainty import LEVEL
 
+SCHEMA_VERSION = 1  # of a calibration's file
 PIXEL_SEED = 0  # the same pixels of a view for every model and seed
 
 
@@ -92,16 +102,15 @@ def sample_views(scene, render_fn, view_ids, num: int, label: str) -> tuple[dict
       `ViewSample` by view, and the seconds that rendering took.
     """
     start = time.perf_counter()
-    rows, pixels = [], []
-    for view in view_ids:
+    rows = {}
+    for view in map(int, view_ids):
         size = int(np.diff(scene.offsets)[view])
-        chosen = np.arange(size)
+        rows[view] = np.arange(size)
         if 0 < num < size:
-            rng = np.random.default_rng((PIXEL_SEED, int(view)))
-            chosen = np.sort(rng.choice(size, num, replace=False))
-        rows.append(chosen)
-        pixels.append(image_pixels(*(int(n) for n in scene.cameras.sizes[view]))[chosen])
-    sizes = [len(chosen) for chosen in rows]
+            rng = np.random.default_rng((PIXEL_SEED, view))
+            rows[view] = np.sort(rng.choice(size, num, replace=False))
+    sizes = [len(chosen) for chosen in rows.values()]
+    pixels = [image_pixels(*map(int, scene.cameras.sizes[v]))[rows[v]] for v in rows]
     with track(sum(sizes), f"{label}: pixels of {len(sizes)} views", "rays") as bar:
         images = render_pixels(
             render_fn,
@@ -112,13 +121,11 @@ def sample_views(scene, render_fn, view_ids, num: int, label: str) -> tuple[dict
             progress_fn=bar.advance,
         )
     seconds = time.perf_counter() - start
-    found, first = {}, 0
-    for view, chosen in zip(view_ids, rows):
+    found = {}
+    for (view, chosen), last in zip(rows.items(), np.cumsum(sizes)):
         at = int(scene.offsets[view]) + chosen
-        part = slice(first, first + len(chosen))
-        first = part.stop
-        found[int(view)] = ViewSample(
-            {name: values[part] for name, values in images.items()},
+        found[view] = ViewSample(
+            {name: values[last - len(chosen) : last] for name, values in images.items()},
             scene.pixels[at] / 255.0,
             None if scene.depth is None else scene.depth[at],
             None if scene.pixel_mask is None else scene.pixel_mask[at],
@@ -189,18 +196,79 @@ def _depth_factor(samples: list[ViewSample]) -> float:
 
 def _without_band(samples: list[ViewSample], quantity: str, factor: float) -> dict:
     """How many pixels have a band where the truth is known, and how wrong the others are."""
-    pairs = [_errors_and_bands(sample, quantity, factor) for sample in samples]
-    errors, banded = (np.concatenate(parts) for parts in zip(*pairs))
+    errors, banded = [], []
+    for sample in samples:
+        truth = sample.truth(quantity)
+        if truth is not None:
+            all_errors, known = render_errors(
+                quantity, sample.image, truth, sample.known, depth_factor=factor
+            )
+            errors.append(all_errors[known])
+            banded.append(has_band(quantity, sample.image)[known])
+    errors, banded = np.concatenate(errors), np.concatenate(banded)
     return {
         "share_with_band": float(banded.mean()),
         "error_without_band": None if banded.all() else float(errors[~banded].mean()),
     }
 
 
-def _errors_and_bands(sample: ViewSample, quantity: str, factor: float) -> tuple:
-    """Of the pixels whose truth is known: errors, and whether they have a band."""
-    truth = sample.truth(quantity)
-    if truth is None:
-        return np.zeros(0), np.zeros(0, bool)
-    errors, known = render_errors(quantity, sample.image, truth, sample.known, depth_factor=factor)
-    return errors[known], has_band(quantity, sample.image)[known]
+def band_arrays(scene, calibration: RenderCalibration, view: int, image: dict) -> dict:
+    """What is rendered of a view, the half-width of its band at `LEVEL` and the truth, [H, W] each.
+
+    Of depth if it was calibrated, else of colour: the channel that is farthest off at each pixel.
+    NaN where a pixel has no band, or no known truth.
+    """
+    banded, true_depth = add_bands(calibration, image, LEVEL), scene.depth_image(view)
+    if calibration.depth is not None and true_depth is not None and (true_depth > 0.0).any():
+        quantity, value, half = "depth", banded["depth"], banded["depth_half"]
+        truth = np.where(true_depth > 0.0, true_depth, np.nan)
+    else:
+        quantity, half = "colour", banded["rgb_half"]
+        rgb, true_rgb = np.clip(banded["rgb"], 0.0, 1.0), scene.image(view) / 255.0
+        worst = np.abs(rgb - true_rgb).argmax(-1)[..., None]
+        value, truth = (np.take_along_axis(x, worst, -1)[..., 0] for x in (rgb, true_rgb))
+    mask = scene.mask_image(view)
+    if mask is not None:
+        truth = np.where(mask, truth, np.nan)
+    arrays = {"value": np.where(np.isnan(half), np.nan, value), "half": half, "truth": truth}
+    arrays = {f"band_{name}": x.astype(np.float32) for name, x in arrays.items()}
+    return arrays | {"band_name": np.array(scene.names[view]), "band_quantity": np.array(quantity)}
+
+
+# --- files ---
+
+
+def calibration_path(folder: pathlib.Path, model: str, seed: int) -> pathlib.Path:
+    """Where the intervals of one model and seed are kept."""
+    return folder / "uncertainty" / model / f"seed_{seed}_calibration.json"
+
+
+def save_calibration(path: pathlib.Path, calibration: RenderCalibration, about: dict) -> None:
+    """Writes intervals, with what they are of.
+
+    Args:
+      path: where to.
+      calibration: the intervals.
+      about: anything that JSON can hold, such as scene, model, seed and views.
+    """
+    values = {"schema_version": SCHEMA_VERSION, **about}
+    write_json(path, values | {"calibration": calibration_to_json(calibration)})
+
+
+def load_calibration(path: pathlib.Path) -> RenderCalibration:
+    """What `save_calibration` wrote; put it around renders with `bands.add_bands`.
+
+    Raises:
+      WorkdirError: the file is missing or broken, or of another version.
+    """
+    values = read_versioned(
+        path,
+        SCHEMA_VERSION,
+        error=WorkdirError,
+        absent="run experiments.evaluate_uncertainty",
+        fix="make it anew",
+    )
+    try:
+        return calibration_from_json(values.get("calibration") or {})
+    except ValueError as error:
+        raise WorkdirError(f"{path}: {error}") from None

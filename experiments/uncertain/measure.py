@@ -1,8 +1,14 @@
-"""One uncertainty model on the test views of one trained field: images, errors and AUSE."""
+"""One seed of `evaluate_uncertainty`: its field, every model on its test views, and the summary.
+
+Each step leaves a file and is not done again: the run's checkpoints, the renders of the common
+field, and of each model the numbers, curves and intervals. The numbers come last.
+"""
 
 from __future__ import annotations
 
 import itertools
+import json
+import pathlib
 import time
 from collections.abc import Callable
 from functools import partial
@@ -16,10 +22,173 @@ from bavs_jax.rendering.images import render_views
 from bavs_jax.uncertainty.bands import uncertainty_of
 from bavs_jax.uncertainty.model import Situation
 from experiments.build import RENDER_CHUNK, Problem
+from experiments.evaluate import mean_quality, spread_evenly
+from experiments.files import read_arrays, read_json, write_arrays, write_json
+from experiments.keys import stream_key
+from experiments.machine import code_commit, device_name, versions
 from experiments.picture_stack import stack_pictures
 from experiments.progress import track
+from experiments.reporting.uncertainty import write_page
+from experiments.reporting.uncertainty_tables import NAME, SCHEMA_VERSION, save_result
+from experiments.trained import FIRST_ROUND, train_run
+from experiments.uncertain import intervals
 
+ROW_VERSION = 2  # of one model and seed; rows of another version are made anew
 IMAGES = ("rgb", "depth", "opacity", "uncertainty", "depth_uncertainty")
+COMMON_MODEL = "entropy"  # fits nothing: what it renders is the run's own field
+
+
+def row_path(folder: pathlib.Path, model: str, seed: int) -> pathlib.Path:
+    """Where the numbers of one model and seed are kept as soon as they are known."""
+    return folder / "uncertainty" / model / f"seed_{seed}.json"
+
+
+def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, command: str) -> None:
+    """Measures every model that has no result yet."""
+    missing = [m for m in config.evaluation.models if not _is_done(row_path(folder, m, seed))]
+    if not missing:
+        return
+    commit = code_commit()  # now: files may be edited while it runs
+    scene, options = problem.scene, config.evaluation
+    situation = trained_situation(config, problem, folder, seed, command)
+    view_ids = spread_evenly(scene.test, options.num_views)
+    key = stream_key(seed, "evaluation")
+    errors_of = partial(pixel_errors, scene, view_ids, scale_depth=options.scale_depth)
+
+    common = folder / "uncertainty" / "common" / f"seed_{seed}.npz"
+    if (kept := load_images(common)) is None:
+        fitted = fit_model(problem, COMMON_MODEL, key, situation)
+        kept = render_model(scene, fitted, view_ids, f"{situation.label}: {COMMON_MODEL}")
+        save_images(common, *kept)
+    common_errors = errors_of(kept[0])
+    common_psnr = mean_quality(scene, view_ids, kept[0])["psnr"]
+
+    for name in missing:
+        fitted = fit_model(problem, name, key, situation)
+        label = f"{situation.label}: {name}"
+        images, render_seconds = kept
+        if name != COMMON_MODEL:
+            images, render_seconds = render_model(scene, fitted, view_ids, label)
+        ause, arrays = {}, {}
+        for field, errors in (("own", errors_of(images)), ("common", common_errors)):
+            found = all_ause(errors, images)
+            ause[field] = {
+                variant: {"ause": one.ause, "unnormalised": one.ause_unnormalised}
+                for variant, one in found.items()
+            }
+            for variant, one in found.items():
+                arrays[f"{field}_{variant}_by_uncertainty"] = one.by_uncertainty
+                arrays[f"{field}_{variant}_by_error"] = one.by_error
+        quality = mean_quality(scene, view_ids, images)
+        if config.num_pictures:
+            shown = spread_evenly(np.arange(len(view_ids)), config.num_pictures)
+            arrays |= picture_arrays(scene, view_ids, images, shown)
+        path = row_path(folder, name, seed)
+        band, numbers, interval_seconds = _measure_intervals(
+            config, scene, fitted, situation, folder, name, seed
+        )
+        seconds = {"fit": fitted.seconds, "render": render_seconds, "intervals": interval_seconds}
+        write_arrays(path.with_suffix(".npz"), **arrays, **band)
+        row = {
+            "row_version": ROW_VERSION,
+            "model": name,
+            "seed": seed,
+            "num_views": int(np.sum(situation.is_training_view)),
+            "num_test_views": len(view_ids),
+            "psnr": quality["psnr"],
+            "ssim": quality["ssim"],
+            "psnr_common": common_psnr,
+            **ause,
+            **numbers,
+            "seconds": seconds,
+            "commit": commit,
+        }
+        write_json(path, row)
+
+
+def trained_situation(config, problem: Problem, folder: pathlib.Path, seed: int, command: str):
+    """The field of a seed at the end of its run of the config's first policy."""
+    policy = config.policies[0] if config.num_rounds else FIRST_ROUND
+    run = train_run(config, problem, folder, policy, seed, command)
+    return run.situation._replace(label=f"seed {seed}")
+
+
+def _is_done(path: pathlib.Path) -> bool:
+    """Whether a row is there with its arrays, made by this version."""
+    row = read_json(path)
+    is_current = row is not None and row.get("row_version") == ROW_VERSION
+    return is_current and read_arrays(path.with_suffix(".npz")) is not None
+
+
+def _measure_intervals(config, scene, fitted, situation, folder, name: str, seed: int) -> tuple:
+    """Calibrates intervals, writes their file, and measures and shows them on test views."""
+    options = config.evaluation
+    groups = intervals.split(scene, situation.is_training_view, options.num_interval_views, seed)
+    label = f"{situation.label}: {name}"
+    samples, seconds = intervals.sample_views(
+        scene, fitted.render, np.concatenate(groups), options.num_interval_pixels, label
+    )
+    calibration, numbers = intervals.calibrate_samples(
+        groups, samples, scale=options.interval_scale, scale_depth=options.scale_depth
+    )
+    views = {part: [int(view) for view in group] for part, group in groups._asdict().items()}
+    about = {
+        "scene": scene.name,
+        "model": name,
+        "seed": seed,
+        "views": {part: [scene.names[view] for view in group] for part, group in views.items()},
+        "pixels_per_view": options.num_interval_pixels,
+    }
+    path = intervals.calibration_path(folder, name, seed)
+    intervals.save_calibration(path, calibration, about)
+    shown = groups.test[:1]
+    image = render_views(fitted.render, scene.cameras, shown, chunk=RENDER_CHUNK)[0]
+    arrays = intervals.band_arrays(scene, calibration, int(shown[0]), image)
+    return arrays, {"intervals": numbers, "interval_views": views}, seconds
+
+
+def write_summary(config, scene, folder: pathlib.Path, command: str) -> tuple:
+    """Collects the rows of all models and seeds into one result file and one page.
+
+    Args:
+      config: see `experiments/configs/base.py`.
+      scene: the scene.
+      folder: where the rows are.
+      command: that made them.
+
+    Returns:
+      the paths of both files.
+    """
+    models, seeds = config.evaluation.models, config.seeds
+    paths = [row_path(folder, model, seed) for model in models for seed in seeds]
+    rows = [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+    # The same for all models of a seed.
+    interval_views = {str(row["seed"]): row.pop("interval_views") for row in rows}
+    result = {
+        "schema_version": SCHEMA_VERSION,
+        "scene": scene.name,
+        "kind": config.loader,
+        "image_size": np.asarray(scene.cameras.sizes).max(axis=0).tolist(),
+        "seeds": list(seeds),
+        "command": command,
+        "config": config.to_dict(),
+        "device": device_name(),
+        "versions": versions(),
+        "pixel_rule": intervals.pixel_rule(config.evaluation.num_interval_pixels),
+        "interval_views": interval_views,
+        "rows": rows,
+    }
+    save_result(folder, result)
+    arrays = {
+        model: [dict(np.load(row_path(folder, model, s).with_suffix(".npz"))) for s in seeds]
+        for model in models
+    }
+    page = folder / "uncertainty.html"
+    write_page(page, result, arrays=arrays, variant=config.evaluation.variant)
+    return folder / NAME, page
+
+
+# --- a model on whole views ---
 
 
 class FittedModel(NamedTuple):
@@ -27,13 +196,6 @@ class FittedModel(NamedTuple):
 
     render: Callable  # rays [chunk] -> images, those of `IMAGES` that the model has
     seconds: float  # that it took to fit
-
-
-class ModelImages(NamedTuple):
-    """What a model says about some views."""
-
-    images: list[dict[str, np.ndarray]]  # of each view
-    seconds: float
 
 
 def fit_model(problem: Problem, name: str, key, situation: Situation) -> FittedModel:
@@ -50,15 +212,15 @@ def fit_model(problem: Problem, name: str, key, situation: Situation) -> FittedM
     return FittedModel(render, seconds)
 
 
-def render_model(scene, fitted: FittedModel, view_ids, label: str) -> ModelImages:
-    """Renders whole views with a fitted model."""
+def render_model(scene, fitted: FittedModel, view_ids, label: str) -> tuple[list[dict], float]:
+    """Renders whole views with a fitted model: the images of each, and the seconds it took."""
     start = time.perf_counter()
     num_rays = int(np.diff(scene.offsets)[view_ids].sum())
     with track(num_rays, f"{label} on {len(view_ids)} views", "rays") as bar:
         rendered = render_views(
             fitted.render, scene.cameras, view_ids, chunk=RENDER_CHUNK, progress_fn=bar.advance
         )
-    return ModelImages(rendered, time.perf_counter() - start)
+    return rendered, time.perf_counter() - start
 
 
 def pixel_errors(scene, view_ids, images: list[dict], *, scale_depth: bool) -> dict[str, list]:
@@ -116,23 +278,6 @@ def all_ause(errors: dict[str, list], images: list[dict]) -> dict[str, Sparsific
     return found
 
 
-def ause_numbers(found: dict[str, Sparsification]) -> dict[str, dict[str, float]]:
-    """Both areas of each variant, for a result file."""
-    return {
-        name: {"ause": one.ause, "unnormalised": one.ause_unnormalised}
-        for name, one in found.items()
-    }
-
-
-def curve_arrays(found: dict[str, Sparsification], prefix: str) -> dict[str, np.ndarray]:
-    """The curves of each variant as arrays with names."""
-    arrays = {}
-    for name, one in found.items():
-        arrays[f"{prefix}_{name}_by_uncertainty"] = one.by_uncertainty
-        arrays[f"{prefix}_{name}_by_error"] = one.by_error
-    return arrays
-
-
 def picture_arrays(scene, view_ids, images: list[dict], shown) -> dict[str, np.ndarray]:
     """Truth, render, colour error and uncertainty of the views at places `shown`."""
     views = [int(view_ids[i]) for i in shown]
@@ -146,3 +291,22 @@ def picture_arrays(scene, view_ids, images: list[dict], shown) -> dict[str, np.n
         "error": np.abs(rgb - truth / 255.0).mean(-1).astype(np.float32),
         "uncertainty": stack_pictures([images[i]["uncertainty"] for i in shown]),
     }
+
+
+def save_images(path: pathlib.Path, images: list[dict[str, np.ndarray]], seconds: float) -> None:
+    """Writes the images of each view, whatever their sizes, and how long they took."""
+    arrays = {f"{i}/{name}": x for i, image in enumerate(images) for name, x in image.items()}
+    write_arrays(path, **arrays, seconds=np.float64(seconds))
+
+
+def load_images(path: pathlib.Path) -> tuple[list[dict[str, np.ndarray]], float] | None:
+    """The inverse of `save_images`; None where there is no file or a damaged one."""
+    arrays = read_arrays(path, "seconds")
+    if arrays is None:
+        return None
+    seconds = float(arrays.pop("seconds"))
+    images = [{} for _ in {key.split("/")[0] for key in arrays}]
+    for key, values in arrays.items():
+        number, name = key.split("/")
+        images[int(number)][name] = values
+    return images, seconds

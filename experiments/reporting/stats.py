@@ -8,7 +8,8 @@ import itertools
 import numpy as np
 from scipy.stats import t as student_t
 
-from experiments.report.results import ReportError, Run
+from experiments.errors import ReportError
+from experiments.reporting.results import Run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,11 +23,16 @@ class Measure:
     better: str  # "higher" or "lower"
 
     @property
+    def heading(self) -> str:
+        """Of a column, with the unit."""
+        return f"{self.label} ({self.unit})" if self.unit else self.label
+
+    @property
     def title(self) -> str:
-        unit = f" ({self.unit})" if self.unit else ""
-        return f"{self.label}{unit}, {self.better} is better"
+        return f"{self.heading}, {self.better} is better"
 
 
+REFERENCES = ("random", "farthest")  # what a policy must beat to be worth its time
 MEASURES = (
     Measure("psnr", "PSNR", "dB", 2, "higher"),
     Measure("ssim", "SSIM", "", 4, "higher"),
@@ -96,17 +102,17 @@ def completed(runs: list[Run], policy: str | None = None) -> list[Run]:
     return [r for r in runs if r.completed and r.rounds and policy in (None, r.policy)]
 
 
-def common_num_views(runs: list[Run]) -> int | None:
-    """The largest number of views that every completed run has been measured at."""
-    sets = [{r["num_views"] for r in run.rounds} for run in completed(runs)]
-    common = set.intersection(*sets) if sets else set()
-    return max(common) if common else None
+def focus_policy(policies: list[str]) -> str | None:
+    """The policy that a report is about: ours where it ran, otherwise the first."""
+    ours = [p for p in policies if p == "bavs"] or [p for p in policies if p.startswith("bavs")]
+    return next(iter(ours or policies), None)
 
 
-def over_seeds(runs: list[Run], policy: str, measure: str, num_views: int) -> Interval | None:
+def over_seeds(
+    runs: list[Run], policy: str, measure: str, num_views: int | None
+) -> Interval | None:
     """Mean over the seeds of a policy."""
-    values = [run.value(measure, num_views) for run in completed(runs, policy)]
-    return mean_interval(v for v in values if v is not None)
+    return mean_interval(by_seed(runs, policy, measure, num_views).values())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,30 +122,23 @@ class Comparison:
     policy: Interval
     reference: Interval
     gap: Interval  # of the paired differences, policy - reference
+    gaps: list[float]  # the differences, seed by seed
 
 
 def compare(
-    runs: list[Run], policy: str, reference: str, measure: str, num_views: int
+    runs: list[Run], policy: str, reference: str, measure: str, num_views: int | None
 ) -> Comparison | None:
     """Pairs the seeds of two policies: the initial views, and so their luck, are the same.
 
     Returns:
       The comparison, or None where no seed has both.
     """
-    pairs = _pairs(runs, policy, reference, measure, num_views)
+    pairs = _pairs(runs, policy, reference, measure, num_views).values()
     if not pairs:
         return None
-    ours, theirs = zip(*pairs.values())
-    gaps = mean_interval(a - b for a, b in pairs.values())
-    return Comparison(mean_interval(ours), mean_interval(theirs), gaps)
-
-
-def paired_gaps(
-    runs: list[Run], policy: str, reference: str, measure: str, num_views: int
-) -> list[float]:
-    """The differences that `compare` averages, one for each seed that both policies have."""
-    pairs = _pairs(runs, policy, reference, measure, num_views)
-    return [a - b for a, b in pairs.values()]
+    ours, theirs = zip(*pairs)
+    gaps = [a - b for a, b in pairs]
+    return Comparison(mean_interval(ours), mean_interval(theirs), mean_interval(gaps), gaps)
 
 
 def mean_round_gap(runs: list[Run], policy: str, reference: str, measure: str) -> Interval | None:
@@ -148,28 +147,39 @@ def mean_round_gap(runs: list[Run], policy: str, reference: str, measure: str) -
     A field trained from few views differs from run to run by luck; the mean over rounds has less
     of that than the last round alone, and it also counts what is gained early.
     """
-    numbers = chosen_num_views(runs)
-    by_round = [_pairs(runs, policy, reference, measure, n) for n in numbers]
+    by_round = [_pairs(runs, policy, reference, measure, n) for n in chosen_num_views(runs)]
     seeds = set.intersection(*map(set, by_round)) if by_round else set()
     return mean_interval(
         np.mean([pairs[seed][0] - pairs[seed][1] for pairs in by_round]) for seed in sorted(seeds)
     )
 
 
-def chosen_num_views(runs: list[Run]) -> list[int]:
-    """Numbers of views at which all completed runs were measured, without the initial views."""
+def shared_num_views(runs: list[Run]) -> list[int]:
+    """Numbers of views at which all completed runs were measured, few views first."""
     sets = [{r["num_views"] for r in run.rounds} for run in completed(runs)]
-    return sorted(set.intersection(*sets))[1:] if sets else []
+    return sorted(set.intersection(*sets)) if sets else []
+
+
+def common_num_views(runs: list[Run]) -> int | None:
+    """The largest number of views that every completed run has been measured at."""
+    return max(shared_num_views(runs), default=None)
+
+
+def chosen_num_views(runs: list[Run]) -> list[int]:
+    """The shared numbers of views without that of the initial views."""
+    return shared_num_views(runs)[1:]
+
+
+def by_seed(runs: list[Run], policy: str, measure: str, num_views: int | None) -> dict[int, float]:
+    """What each completed run of a policy reached, where it is known."""
+    values = {run.seed: run.value(measure, num_views) for run in completed(runs, policy)}
+    return {seed: value for seed, value in values.items() if value is not None}
 
 
 def _pairs(runs, policy, reference, measure, num_views) -> dict[int, tuple[float, float]]:
     """By seed, what the two policies reached."""
-    ours, theirs = (
-        {run.seed: run.value(measure, num_views) for run in completed(runs, name)}
-        for name in (policy, reference)
-    )
-    pairs = {seed: (value, theirs.get(seed)) for seed, value in ours.items()}
-    return {seed: pair for seed, pair in pairs.items() if None not in pair}
+    ours, theirs = (by_seed(runs, name, measure, num_views) for name in (policy, reference))
+    return {seed: (value, theirs[seed]) for seed, value in ours.items() if seed in theirs}
 
 
 def mean_curve(runs: list[Run], policy: str, measure: str) -> list[tuple[int, Interval]]:

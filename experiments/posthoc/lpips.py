@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import pathlib
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from experiments import runtime, workdir
 from experiments.build import Problem, build_problem
@@ -14,39 +13,45 @@ from experiments.errors import ConfigError, WorkdirError
 from experiments.evaluate import measure_test_views
 from experiments.files import read_json, write_json
 from experiments.parts import is_completed
-from experiments.report import write_report
+from experiments.reporting.report import write_report
 from experiments.sweeps.record import read_record
 from experiments.trained import TrainedRun, field_kind, find_runs, load_run, saved_config
 
 PSNR_TOLERANCE = 0.02  # dB; another machine adds up in another order
 
 
-class Wanted(NamedTuple):
-    """What to measure, as the flags say."""
-
-    lpips_net: str = "alex"
-    policies: Sequence[str] = ()  # none: all
-    data_dir: str = ""  # empty: where the runs had it
-
-
-def remeasure(folder: pathlib.Path, wanted: Wanted, command: str) -> None:
+def remeasure(
+    folder: pathlib.Path,
+    command: str,
+    *,
+    lpips_net: str = "alex",
+    policies: Sequence[str] = (),
+    data_dir: str = "",
+) -> None:
     """Every setting of a sweep, or the one experiment that the folder holds.
+
+    Args:
+      folder: of the runs.
+      command: that is noted in their result files.
+      lpips_net: network of LPIPS.
+      policies: whose runs; none: all.
+      data_dir: where scenes are; empty: where the runs had them.
 
     Raises:
       ConfigError: LPIPS is not installed, or there is no finished run of a policy.
       WorkdirError, SceneError: the folder or the scene cannot be used.
     """
     record = read_record(folder)
-    rows = [] if record is None else record.settings
-    for setting in [folder / row["folder"] for row in rows] or [folder]:
-        _measure_folder(setting, wanted, command)
+    rows = [{"folder": "."}] if record is None else record.settings
+    for setting in [folder / row["folder"] for row in rows]:
+        _measure_folder(setting, command, lpips_net, policies, data_dir)
 
 
-def _measure_folder(folder: pathlib.Path, wanted: Wanted, command: str) -> None:
+def _measure_folder(folder: pathlib.Path, command: str, lpips_net, policies, data_dir) -> None:
     config = saved_config(folder)
-    config.lpips_net = wanted.lpips_net
-    config.data_dir = wanted.data_dir or config.data_dir
-    todo = _runs_without(folder, wanted)
+    config.lpips_net = lpips_net
+    config.data_dir = data_dir or config.data_dir
+    todo = _runs_without(folder, lpips_net, policies)
     if not todo:
         print(f"{folder}: nothing is left to measure")
         return
@@ -87,23 +92,21 @@ def measure_run(run: TrainedRun, label: str, command: str) -> None:
     print(f"{label}: LPIPS {measures['lpips']:.4f}, PSNR {measures['psnr']:.2f} dB as before")
 
 
-def _runs_without(folder: pathlib.Path, wanted: Wanted) -> list[tuple[str, int]]:
+def _runs_without(folder: pathlib.Path, lpips_net: str, policies) -> list[tuple[str, int]]:
     """(policy, seed) of the runs that have ended and lack this network's LPIPS."""
     results = {}
     for policy, seed in find_runs(folder):
         path = folder / policy / f"seed_{seed}" / "result.json"
         result = read_json(path, otherwise="left out; start its run again, which makes it anew")
         results |= {(policy, seed): result} if is_completed(result) else {}
-    for policy in wanted.policies:
-        if policy not in {name for name, _ in results}:
+    known = {name for name, _ in results}
+    for policy in policies:
+        if policy not in known:
             raise ConfigError(f"--policy: {policy}: {folder} holds no finished run of it")
-    return [
-        (policy, seed)
-        for (policy, seed), result in results.items()
-        if policy in (wanted.policies or (policy,)) and not _is_measured(result, wanted.lpips_net)
-    ]
-
-
-def _is_measured(result: dict, lpips_net: str) -> bool:
-    net = result.get("lpips_net", result["config"]["lpips_net"])
-    return net == lpips_net and result["rounds"][-1]["lpips"] is not None
+    found = []
+    for (policy, seed), result in results.items():
+        net = result.get("lpips_net", result["config"]["lpips_net"])
+        is_measured = net == lpips_net and result["rounds"][-1]["lpips"] is not None
+        if policy in (policies or known) and not is_measured:
+            found.append((policy, seed))
+    return found

@@ -1,20 +1,28 @@
-"""Curves and bars as inline SVG, drawn with matplotlib's objects and no global state."""
+"""Curves and bars of runs; how every figure looks, and how it becomes an element of a page."""
 
 from __future__ import annotations
 
 import io
+import os
+import pathlib
 import re
 
 import matplotlib
+from markupsafe import Markup
 from matplotlib import patheffects
+from matplotlib import style as matplotlib_style
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator
 
-from experiments.report import stats
-from experiments.report.headline import REFERENCES
-from experiments.report.results import Run
+from experiments.files import write_atomic
+from experiments.reporting import stats
+from experiments.reporting.results import Run
+from experiments.reporting.stats import REFERENCES
+from experiments.reporting.tables import seconds
+
+matplotlib_style.use(pathlib.Path(__file__).parent / "reporting.mplstyle")
 
 MANY = 7  # policies from which curves crowd, and each no longer has a colour of its own
 # Okabe and Ito 2008: told apart by colour-blind readers. Yellow is left out, too pale on white.
@@ -32,10 +40,11 @@ PARTS = {
 }
 MIN_BAND = 3  # seeds; an interval over two is 13 standard errors wide and hides all else
 GREY, PALE = "#6b7280", "#c3c8d0"
+DOT = {"markeredgecolor": "white"}
 
 
-def to_svg(figure: Figure, *, salt: str, label: str) -> str:
-    """A figure as an `<svg>` element that may stand in a page beside others.
+def to_svg(figure: Figure, *, salt: str, label: str) -> Markup:
+    """A figure as an `<svg>` element that may stand in a page beside others, as it is.
 
     Args:
       figure: what to draw.
@@ -43,7 +52,7 @@ def to_svg(figure: Figure, *, salt: str, label: str) -> str:
       label: what it shows, for readers who do not see it.
     """
     buffer = io.StringIO()
-    with matplotlib.rc_context({"svg.hashsalt": salt, "svg.fonttype": "path"}):
+    with matplotlib.rc_context({"svg.hashsalt": salt}):
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
     svg = buffer.getvalue()
     svg = svg[svg.index("<svg") :]
@@ -52,15 +61,20 @@ def to_svg(figure: Figure, *, salt: str, label: str) -> str:
     svg = re.sub(r'<g id="[^"]*_\d+">', "<g>", svg)
     # Glyphs are defined per figure; a viewer that looks one up by id may find another figure's.
     svg = re.sub(r"(id=\"|href=\"#|url\(#)", rf"\g<1>{salt}-", svg)
-    return svg.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1)
+    return Markup(svg.replace("<svg ", f'<svg role="img" aria-label="{label}" ', 1))
 
 
-def tidy(axes: Axes) -> None:
-    """Takes away what carries no information."""
+def save_figure(figure: Figure, path: str | os.PathLike) -> None:
+    """Writes a figure whole or not at all; the end of its name, such as `.pdf`, is the format."""
+    form = pathlib.Path(path).suffix.removeprefix(".")
+    write_atomic(path, lambda file: figure.savefig(file, format=form))
+
+
+def tidy(axes: Axes, grid: str | None = None) -> None:
+    """Takes the frame away but for the axes, and draws lines across one of them, "x" or "y"."""
     axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color("#9ca3af")
-    axes.tick_params(colors="#374151", labelsize=9)
-    axes.set_axisbelow(True)
+    if grid is not None:
+        axes.grid(axis=grid)
 
 
 def policy_style(policies: list[str]) -> dict[str, tuple[str, str]]:
@@ -75,13 +89,17 @@ def policy_style(policies: list[str]) -> dict[str, tuple[str, str]]:
     }
 
 
-def quality_plot(
-    runs: list[Run], policies: list[str], measure: stats.Measure, coloured: list[str]
-) -> str | None:
-    """`quality_figure` as an element of a page."""
-    figure = quality_figure(runs, policies, measure, coloured)
-    label = f"{measure.label} against training views"
-    return None if figure is None else to_svg(figure, salt=f"quality-{measure.key}", label=label)
+def in_colour(runs: list[Run], policies: list[str], focus: str | None) -> list[str]:
+    """The policies whose curves are told apart: all, or of many the few that matter most.
+
+    Those are ours, the references, and the best of the others at the end.
+    """
+    if len(policies) <= MANY:
+        return policies
+    num_views = stats.common_num_views(runs)
+    finals = {p: stats.over_seeds(runs, p, "psnr", num_views) for p in policies}
+    ranked = sorted((p for p in policies if finals[p]), key=lambda p: -finals[p].mean)
+    return list(dict.fromkeys(p for p in (focus, *REFERENCES, *ranked[:2]) if p in policies))
 
 
 def quality_figure(
@@ -92,61 +110,49 @@ def quality_figure(
     Policies that are not in `coloured` are thin grey means without names.
     """
     style = policy_style(coloured)
-    figure = Figure(figsize=(5.4, 3.7), layout="constrained")
+    figure = Figure(figsize=(5.4, 3.7))
     axes = figure.add_subplot()
-    ends = []  # (last number of views, last value, policy) for the labels
+    ends = []  # (last number of views, last value, name, colour) for the labels
     numbers = set()
     for policy in policies:
-        mine = [run for run in runs if run.policy == policy]
+        curve = stats.mean_curve(runs, policy, measure.key)
+        x, means = [n for n, _ in curve], [i.mean for _, i in curve]
         if policy not in style:
-            curve = stats.mean_curve(runs, policy, measure.key)
-            axes.plot([n for n, _ in curve], [i.mean for _, i in curve], color=PALE, zorder=0.5)
+            axes.plot(x, means, color=PALE, zorder=0.5)
             continue
         colour, marker = style[policy]
-        for run in mine:
-            points = _points(run, measure.key)
-            if not points:
+        single = []
+        for run in runs:
+            if run.policy != policy or not (points := _points(run, measure.key)):
                 continue
             numbers.update(n for n, _ in points)
-            single = {"linewidth": 0.8, "alpha": 0.45}
+            look = {"linewidth": 0.8, "alpha": 0.45}
             if not run.completed:
-                single = {"linewidth": 1.6, "linestyle": ":", "marker": marker, "markersize": 3.5}
-            axes.plot(*zip(*points), color=colour, zorder=2, **single)
-        curve = stats.mean_curve(runs, policy, measure.key)
+                look = {"linewidth": 1.6, "linestyle": ":", "marker": marker, "markersize": 3.5}
+            axes.plot(*zip(*points), color=colour, zorder=2, **look)
+            single = single or points
         if curve:
-            x, means = [n for n, _ in curve], [i.mean for _, i in curve]
             halves = [i.half if i.num >= MIN_BAND else 0.0 for _, i in curve]
             if any(halves):
-                low = [m - h for m, h in zip(means, halves)]
-                high = [m + h for m, h in zip(means, halves)]
+                low, high = ([m + s * h for m, h in zip(means, halves)] for s in (-1, 1))
                 axes.fill_between(x, low, high, color=colour, alpha=0.14, linewidth=0, zorder=1)
-            axes.plot(
-                x,
-                means,
-                color=colour,
-                marker=marker,
-                markersize=5.5,
-                markeredgecolor="white",
-                markeredgewidth=0.7,
-                linewidth=2.0,
-                zorder=3,
-            )
-            ends.append((x[-1], means[-1], policy))
-        elif any(points := _points(run, measure.key) for run in mine):
-            ends.append((*points[-1], f"{policy} (incomplete)"))
+            look = {"marker": marker, "markersize": 5.5, "markeredgewidth": 0.7, **DOT}
+            axes.plot(x, means, color=colour, linewidth=2.0, zorder=3, **look)
+            ends.append((x[-1], means[-1], policy, colour))
+        elif single:
+            ends.append((*single[-1], f"{policy} (incomplete)", colour))
     if not numbers:
         return None
-    axes.set_xlabel("training views", fontsize=10, color="#374151")
-    axes.set_title(measure.title, fontsize=10.5, loc="left", color="#111827")
-    axes.grid(axis="y", color="#e5e7eb", linewidth=0.8)
+    axes.set_xlabel("training views")
+    axes.set_title(measure.title)
     axes.yaxis.set_major_locator(MaxNLocator(6))
     axes.xaxis.set_major_locator(
         FixedLocator(sorted(numbers)) if len(numbers) <= 10 else MaxNLocator(8, integer=True)
     )
     # By the runs themselves: bands over two or three seeds are so wide that nothing else shows.
     axes.set_ylim(*_padded([v for run in runs for _, v in _points(run, measure.key)]))
-    tidy(axes)
-    _label_ends(axes, ends, {**style, **{f"{p} (incomplete)": s for p, s in style.items()}})
+    tidy(axes, "y")
+    _label_ends(axes, ends)
     return figure
 
 
@@ -161,78 +167,47 @@ def _points(run: Run, measure: str) -> list[tuple[int, float]]:
     return [(n, value) for n, value in pairs if value is not None]
 
 
-def _label_ends(axes: Axes, ends: list, style: dict) -> None:
+def _label_ends(axes: Axes, ends: list) -> None:
     """Writes each policy's name beside the end of its line, moved apart where they would touch."""
     low, high = axes.get_ylim()
     gap = 0.065 * (high - low)
     lowest = {}  # by number of views, where there is room for the next name
-    for x, y, policy in sorted(ends, key=lambda end: end[1]):
+    for x, y, name, colour in sorted(ends, key=lambda end: end[1]):
         y_text = max(y, lowest.get(x, y))
         lowest[x] = y_text + gap
-        text = axes.annotate(
-            policy,
-            xy=(x, y),
-            xytext=(9, (y_text - y) / (high - low) * 200),  # 200 points: about the axes' height
-            textcoords="offset points",
-            color=style[policy][0],
-            fontsize=9.5,
-            fontweight="bold",
-            va="center",
-            annotation_clip=False,
-            zorder=5,
-        )
+        place = (9, (y_text - y) / (high - low) * 200)  # 200 points: about the axes' height
+        look = {"color": colour, "fontsize": 9.5, "fontweight": "bold", "va": "center", "zorder": 5}
+        options = {"textcoords": "offset points", "annotation_clip": False}
+        text = axes.annotate(name, xy=(x, y), xytext=place, **options, **look)
         text.set_path_effects([patheffects.withStroke(linewidth=3, foreground="white")])
     axes.set_ylim(low, high)
 
 
-def timing_plot(runs: list[Run], policies: list[str]) -> str | None:
+def timing_plot(runs: list[Run], policies: list[str]) -> Markup | None:
     """Where the time went, a stacked bar per policy, or None if nothing has been completed."""
     rows = [p for p in policies if stats.completed(runs, p)]
     if not rows:
         return None
-    figure = Figure(figsize=(10.6, 1.15 + 0.42 * len(rows)), layout="constrained")
+    figure = Figure(figsize=(10.6, 1.15 + 0.42 * len(rows)))
     axes = figure.add_subplot()
     left = [0.0] * len(rows)
+    look = {"height": 0.62, "edgecolor": "white", "linewidth": 0.8}
     for part, (label, colour) in PARTS.items():
         widths = [stats.mean_seconds(runs, policy, part) for policy in rows]
-        axes.barh(
-            range(len(rows)),
-            widths,
-            left=left,
-            height=0.62,
-            color=colour,
-            edgecolor="white",
-            linewidth=0.8,
-            label=label,
-        )
+        axes.barh(range(len(rows)), widths, left=left, color=colour, label=label, **look)
         left = [a + b for a, b in zip(left, widths)]
     for row, total in enumerate(left):
-        axes.annotate(
-            f" {seconds(total)}", xy=(total, row), va="center", fontsize=9.5, color="#111827"
-        )
+        axes.annotate(f" {seconds(total)}", xy=(total, row), va="center", fontsize=9.5)
     axes.set_yticks(range(len(rows)), rows)
     axes.invert_yaxis()
     axes.set_xlim(0.0, max(1.12 * max(left), 1e-3))
-    axes.set_xlabel("seconds for all rounds of one run, mean over seeds", fontsize=10)
-    tidy(axes)
-    axes.grid(axis="x", color="#e5e7eb", linewidth=0.8)
-    figure.legend(
-        loc="outside upper left", ncols=len(PARTS), frameon=False, fontsize=9, handlelength=1.2
-    )
+    axes.set_xlabel("seconds for all rounds of one run, mean over seeds")
+    tidy(axes, "x")
+    figure.legend(loc="outside upper left", ncols=len(PARTS), handlelength=1.2)
     return to_svg(figure, salt="timings", label="Seconds spent per policy and part of the work")
 
 
-def seconds(value: float) -> str:
-    """A duration in words: `0.42 s`, `12.3 s`, `3 min 20 s`."""
-    if value < 9.995:
-        return f"{value:.2f} s"
-    if value < 119.95:
-        return f"{value:.1f} s"
-    minutes, rest = divmod(round(value), 60)
-    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{value / 3600:.2f} h"
-
-
-def gap_plot(runs: list[Run], policies: list[str], coloured: list[str]) -> str | None:
+def gap_plot(runs: list[Run], policies: list[str], coloured: list[str]) -> Markup | None:
     """PSNR of each policy minus that of random choice, seed by seed; None without random.
 
     Large dots are means with their 95 % intervals, small ones single seeds. The scale follows the
@@ -243,44 +218,26 @@ def gap_plot(runs: list[Run], policies: list[str], coloured: list[str]) -> str |
     num_views = stats.common_num_views(runs)
     if num_views is None or len(policies) < 3:
         return None
-    rows = []
-    for policy in policies:
-        pair = stats.compare(runs, policy, reference, "psnr", num_views)
-        if policy != reference and pair is not None:
-            seeds = stats.paired_gaps(runs, policy, reference, "psnr", num_views)
-            rows.append((pair.gap, seeds, policy))
+    others = [policy for policy in policies if policy != reference]
+    pairs = {policy: stats.compare(runs, policy, reference, "psnr", num_views) for policy in others}
+    rows = [(pair.gap, pair.gaps, policy) for policy, pair in pairs.items() if pair is not None]
     if not rows:
         return None
     rows.sort(key=lambda row: row[0].mean)
     style = policy_style(coloured)
-    figure = Figure(figsize=(10.6, 1.0 + 0.28 * len(rows)), layout="constrained")
+    figure = Figure(figsize=(10.6, 1.0 + 0.28 * len(rows)))
     axes = figure.add_subplot()
     axes.axvline(0.0, color=GREY, linewidth=1.2, zorder=1)
     for place, (gap, seeds, policy) in enumerate(rows):
-        colour, _ = style.get(policy, (GREY, None))
+        look = {"color": style.get(policy, (GREY, None))[0], "edgecolors": "white"}
         if gap.half is not None:
-            axes.plot([gap.low, gap.high], [place, place], color=colour, linewidth=1.6, zorder=2)
-        single = {"s": 20, "edgecolors": "white", "linewidths": 0.6, "zorder": 2.5}
-        axes.scatter(seeds, [place] * len(seeds), color=colour, **single)
-        axes.scatter([gap.mean], [place], s=70, color=colour, edgecolors="white", zorder=3)
+            axes.hlines(place, gap.low, gap.high, color=look["color"], linewidth=1.6, zorder=2)
+        axes.scatter(seeds, [place] * len(seeds), s=20, linewidths=0.6, zorder=2.5, **look)
+        axes.scatter([gap.mean], [place], s=70, zorder=3, **look)
     values = [0.0] + [g for _, seeds, _ in rows for g in seeds]
     margin = 0.15 * (max(values) - min(values)) + 0.05
     axes.set_xlim(min(values) - margin, max(values) + margin)
     axes.set_yticks(range(len(rows)), [policy for _, _, policy in rows])
-    axes.set_xlabel(f"PSNR minus that of {reference} with {num_views} views (dB)", fontsize=10)
-    tidy(axes)
-    axes.grid(axis="x", color="#e5e7eb", linewidth=0.8)
+    axes.set_xlabel(f"PSNR minus that of {reference} with {num_views} views (dB)")
+    tidy(axes, "x")
     return to_svg(figure, salt="gaps", label=f"PSNR gap of each policy to {reference}")
-
-
-def in_colour(runs: list[Run], policies: list[str], focus: str | None) -> list[str]:
-    """The policies whose curves are told apart: all, or of many the few that matter most.
-
-    Those are ours, the references, and the best of the others at the end.
-    """
-    if len(policies) <= MANY:
-        return policies
-    num_views = stats.common_num_views(runs)
-    finals = {p: stats.over_seeds(runs, p, "psnr", num_views) for p in policies}
-    ranked = sorted((p for p in policies if finals[p]), key=lambda p: -finals[p].mean)
-    return list(dict.fromkeys(p for p in (focus, *REFERENCES, *ranked[:2]) if p in policies))

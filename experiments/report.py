@@ -3,21 +3,18 @@
 python -m experiments.report --workdir=runs/quickstart
 """
 
-import sys
+from __future__ import annotations
 
 from absl import flags
 
 from experiments import runtime
-from experiments.report import ReportError, write_report
+from experiments.reporting.report import write_report
 
 WORKDIR = flags.DEFINE_string("workdir", None, "Folder with summary.json.", required=True)
 
 
 def main() -> None:
-    try:
-        print(write_report(WORKDIR.value))
-    except ReportError as error:
-        sys.exit(f"error: {error}")
+    print(write_report(WORKDIR.value))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,1 @@
+"""Results read from their files, and shown: tables, plots, pictures and pages."""
