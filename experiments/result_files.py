@@ -12,7 +12,7 @@ from experiments.posthoc.tables import TABLES as POSTHOC_TABLES
 from experiments.report.collected import Collected, collect_tables
 from experiments.report.results import read_result
 from experiments.report.tables import Table
-from experiments.sweeps.record import FILE as SWEEP_FILE
+from experiments.sweeps.plan import FILE as SWEEP_FILE
 from experiments.uncertain import results as uncertain
 from experiments.uncertain.tables import coverage_table, summary_table
 

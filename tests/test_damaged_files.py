@@ -17,7 +17,7 @@ from experiments import parts, runs, runtime, workdir
 from experiments.errors import ReportError, WorkdirError
 from experiments.files import append_line, read_arrays, read_json, write_arrays, write_json
 from experiments.report import write_report
-from experiments.sweeps.local import StepCounter
+from experiments.sweeps.plan import StepCounter
 from experiments.trained import saved_config
 from tests.toy_runs import TINY, same_results, toy_config, toy_flags
 

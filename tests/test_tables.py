@@ -19,7 +19,7 @@ from experiments.report.paper_table import TABLES
 from experiments.report.results import load_runs
 from experiments.report.stats import mean_runs
 from experiments.report.tables import Cell, Table, interval_cell
-from experiments.sweeps.record import Record, write_record
+from experiments.sweeps.plan import Record, write_record
 from experiments.tables import MARKED, fill_page, result_tables
 from tests.report_files import make_result, write_workdir
 

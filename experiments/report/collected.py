@@ -18,8 +18,8 @@ from experiments.report.tables import (
     rounds_table,
     timing_table,
 )
-from experiments.sweeps.record import FILE as SWEEP_FILE
-from experiments.sweeps.record import Record, read_record
+from experiments.sweeps.plan import FILE as SWEEP_FILE
+from experiments.sweeps.plan import Record, read_record
 
 RUN_TABLES = {
     "quality": final_table,
