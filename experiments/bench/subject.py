@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from ml_collections import ConfigDict
 
@@ -74,7 +72,6 @@ class Subject(NamedTuple):
     toolbox: Toolbox
     trainer: Trainer
     is_training_view: np.ndarray  # [V] bool
-    count_samples: Callable  # (TrainState, rays [R]) -> samples of each ray [R]
 
     @property
     def scene(self) -> Scene:
@@ -99,15 +96,7 @@ def make_subject(config, scene: Scene, num_views: int) -> Subject:
     problem = build_problem(changed(config, lpips_net=""), scene)
     is_training = view_mask(problem.table, initial_views(scene, SEED, num_views))
     trainer = build_trainer(config, scene, len(is_training), RECONSTRUCTION)
-    sampler = trainer.sampler
-
-    @jax.jit
-    def count_samples(state, rays):
-        samples, _ = sampler.sample(None, state.params["sampler"], state.sampler_state, rays)
-        return samples.sample_mask.sum(-1)
-
-    toolbox = problem.make_toolbox(track)
-    return Subject(config, problem, toolbox, trainer, is_training, count_samples)
+    return Subject(config, problem, problem.make_toolbox(track), trainer, is_training)
 
 
 def train_field(subject: Subject) -> TrainState:
