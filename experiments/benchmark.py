@@ -31,9 +31,9 @@ from experiments.bench.subject import (
 from experiments.build_scene import load_config_scene
 from experiments.configs import base
 from experiments.files import write_json
-from experiments.machine import device_name, peak_device_memory_mb, peak_memory_mb, versions
 from experiments.progress import track
 from experiments.report.collected import collected_text
+from experiments.runtime import device_name, peak_device_memory_mb, peak_memory_mb, versions
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS

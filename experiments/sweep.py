@@ -19,7 +19,7 @@ import sys
 from absl import flags
 from ml_collections import config_flags
 
-from experiments import compilation, runtime, workdir
+from experiments import runtime, workdir
 from experiments.files import exclusive
 from experiments.progress import track
 from experiments.report import write_report
@@ -28,7 +28,7 @@ from experiments.sweeps import jobs, plan
 from experiments.sweeps.axes import parse_axes
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(compilation)
+runtime.define_cache_flags()
 config_flags.DEFINE_config_file(
     "config", None, "What to run; see experiments.active_selection.", lock_config=True
 )
@@ -152,7 +152,7 @@ def write_outputs(settings: list[plan.Setting]) -> None:
 def sweep(settings: list[plan.Setting], folder: pathlib.Path, given: list[str]) -> int:
     """The whole sweep; `given` are the config's flags. Returns how many trials failed."""
     record = claim_folders(settings, folder)
-    cache = compilation.as_flags()
+    cache = runtime.cache_flags()
     trials = [trial for s in settings for trial in plan.make_trials(s, given, cache)]
     planned = sum(part.policy is not None for s in settings for part in s.parts)
     left = sum(trial.part.policy is not None for trial in trials)

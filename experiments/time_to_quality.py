@@ -30,8 +30,8 @@ from experiments.build_scene import load_config_scene
 from experiments.configs import base
 from experiments.errors import ConfigError
 from experiments.files import write_json
-from experiments.machine import versions
 from experiments.report.collected import collected_text
+from experiments.runtime import versions
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS

@@ -19,7 +19,7 @@ from experiments.build_trainer import Trainer, train_aside
 from experiments.progress import track
 from experiments.report.results import Run
 from experiments.report.tables import final_table
-from experiments.suggest.training import train_field
+from experiments.suggest.choosing import train_field
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 

@@ -17,7 +17,7 @@ from experiments.build_scene import check_views
 from experiments.configs import base, paper, quickstart
 from experiments.errors import ConfigError
 from experiments.schema import FLAG, SCHEMA, TEXT, check_config, leaves
-from experiments.suggest.settings import default_config
+from experiments.suggest.choosing import default_config
 from experiments.sweeps.axes import MAX_TRIALS, parse_axes
 from tests.toy_runs import OVERRIDES, toy_config
 from tests.toy_scenes import toy_scene

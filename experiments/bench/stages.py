@@ -32,8 +32,8 @@ from experiments.bench.subject import (
 from experiments.build import RENDER_CHUNK
 from experiments.build_trainer import Trainer, build_trainer
 from experiments.keys import run_key, stream_key
-from experiments.machine import peak_device_memory_mb, peak_memory_mb
 from experiments.progress import track
+from experiments.runtime import peak_device_memory_mb, peak_memory_mb
 
 # --- the clock -------------------------------------------------------------------------------
 

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 from experiments.errors import ConfigError, WorkdirError
 from experiments.files import read_versioned, write_json
-from experiments.parts import Part, all_parts, is_finished
 from experiments.sweeps.axes import Axes, setting_name, settings
 from experiments.sweeps.jobs import Job
+from experiments.workdir import Part, all_parts, is_finished
 
 UNCHANGED = "unchanged"  # folder of the config as it is, beside those of changes
 SCRIPT = ("-m", "experiments.active_selection")

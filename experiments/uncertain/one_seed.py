@@ -16,7 +16,7 @@ from experiments.build import RENDER_CHUNK, Problem
 from experiments.evaluate import mean_quality, spread_evenly
 from experiments.files import read_arrays, read_json, write_arrays, write_json
 from experiments.keys import stream_key
-from experiments.machine import code_commit
+from experiments.runtime import code_commit
 from experiments.trained import FIRST_ROUND, train_run
 from experiments.uncertain import intervals, measure
 from experiments.uncertain.files import calibration_path, load_images, save_calibration, save_images

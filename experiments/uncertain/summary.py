@@ -7,7 +7,7 @@ import pathlib
 
 import numpy as np
 
-from experiments.machine import device_name, versions
+from experiments.runtime import device_name, versions
 from experiments.uncertain.intervals import pixel_rule
 from experiments.uncertain.page import write_page
 from experiments.uncertain.results import NAME, SCHEMA_VERSION, row_path, save_result
