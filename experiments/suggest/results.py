@@ -119,17 +119,19 @@ def write_csv(path: pathlib.Path, poses, rows: list[dict]) -> None:
 # --- what is shown of them -------------------------------------------------------------------
 
 
-def preview_cards(images: list[dict], rows: list[dict], sentences: list[str]) -> tuple:
+def preview_cards(images: list[dict], rows: list[dict], poses, facts) -> tuple[list, dict]:
     """One card per pose with its render and uncertainty, and the scale of the latter."""
     limits = uncertainty_limits([{"uncertainty": image["uncertainty"][None]} for image in images])
     cards = []
-    for image, row, sentence in zip(images, rows, sentences):
+    for image, row, pose, fact in zip(images, rows, poses, facts):
         rgb = np.round(255.0 * np.clip(image["rgb"], 0.0, 1.0)).astype(np.uint8)
         uncertainty = colourise(shrink(image["uncertainty"], MAX_SIDE), *limits, UNCERTAINTY_MAP)
         cards.append(
             {
                 "row": row,
-                "sentence": sentence,
+                "place": pose[:3, 3],
+                "look": -pose[:3, 2],
+                "sentence": fact.sentence(),
                 "render": png_uri(shrink(rgb, MAX_SIDE)),
                 "uncertainty": png_uri(uncertainty),
                 "mean": f"{image['uncertainty'].mean():.3f}",
@@ -177,30 +179,12 @@ def make_rows(suggestion: Suggestion, order) -> list[dict]:
     ]
 
 
-def render_previews(problem: Problem, train, jac_sq_sum, cameras: Cameras) -> list[dict]:
-    """Colour, opacity and uncertainty of the chosen poses."""
+def render_uncertain(problem: Problem, train, jac_sq_sum, cameras: Cameras, label: str) -> list:
+    """Colour, opacity and uncertainty of every camera."""
     render = problem.render(train, jac_sq_sum, photo_rays(problem))
-    num_rays = int(num_pixels(cameras).sum())
-    with track(num_rays, f"render {len(cameras)} previews", "rays") as bar:
-        return render_views(
-            render, cameras, np.arange(len(cameras)), chunk=RENDER_CHUNK, progress_fn=bar.advance
-        )
-
-
-def photo_uncertainty(problem: Problem, train, jac_sq_sum, scale: float) -> np.ndarray:
-    """Uncertainty of all pixels of the photos at the reduced size."""
-    small = reduced_cameras(take(problem.scene.cameras, problem.scene.pool), scale)
-    render = problem.render(train, jac_sq_sum, photo_rays(problem))
-    num_rays = int(num_pixels(small).sum())
-    with track(num_rays, f"score the {len(small)} photos", "rays") as bar:
-        images = render_views(
-            lambda rays: {"uncertainty": render(rays)["uncertainty"]},
-            small,
-            np.arange(len(small)),
-            chunk=RENDER_CHUNK,
-            progress_fn=bar.advance,
-        )
-    return np.concatenate([image["uncertainty"].ravel() for image in images])
+    views = np.arange(len(cameras))
+    with track(int(num_pixels(cameras).sum()), label, "rays") as bar:
+        return render_views(render, cameras, views, chunk=RENDER_CHUNK, progress_fn=bar.advance)
 
 
 def write_results(
@@ -263,19 +247,22 @@ def write_results(
     write_camera_path(normalised, scene_poses, as_photos)
     write_csv(files["table"], poses, rows)
 
-    pixels = photo_uncertainty(problem, train, jac_sq_sum, options.score_scale)
-    images = render_previews(problem, train, jac_sq_sum, picked_cameras)
+    small = reduced_cameras(take(scene.cameras, scene.pool), options.score_scale)
+    label = f"score the {len(small)} photos"
+    seen = render_uncertain(problem, train, jac_sq_sum, small, label)
+    label = f"render {len(chosen)} previews"
+    images = render_uncertain(problem, train, jac_sq_sum, picked_cameras, label)
     facts = words.pose_facts(
-        scene, around, picked_cameras, images, photo_uncertainty=pixels, density_fn=density_fn
+        scene,
+        around,
+        picked_cameras,
+        images,
+        photo_uncertainty=np.concatenate([image["uncertainty"].ravel() for image in seen]),
+        density_fn=density_fn,
     )
     worth_words = words.worth_sentence(suggestion.worth, suggestion.photo_gain)
-    foggy = photos_in_matter(scene, density_fn, around)
-
-    cards_rows = [row | {"place": words.place_words(pose)} for row, pose in zip(rows, poses)]
-    cards, bar = preview_cards(images, cards_rows, [f.sentence() for f in facts])
+    cards, bar = preview_cards(images, rows, poses, facts)
     start = last_photo if options.start is None else options.start
-    width, height = (int(n) for n in picked_cameras.sizes[0])
-    portrait = height > width
     place = plots.place_plot(
         axes=plots.levelled_axes(scene.up, photos[:, :, 3], around.focus),
         unit=around.unit,
@@ -286,24 +273,34 @@ def write_results(
         selected=chosen,
         route_start=around.to_scene(start) if options.route else None,
     )
+    width, height = (int(n) for n in picked_cameras.sizes[0])
+    info = suggestion.info
     write_template(
         files["report"],
         pathlib.Path(__file__).parent,
-        title=scene.name,
-        headline=words.headline(scene, suggestion, proposals),
+        scene=scene,
+        options=options,
+        around=around,
+        proposals=proposals,
+        length=words.length,
+        portrait=height > width,
         worth=worth_words,
-        warnings=words.warnings(scene, around, facts, foggy),
+        num_foggy=photos_in_matter(scene, density_fn, around),
+        num_unseen=sum(fact.num_seeing == 0 for fact in facts),
+        num_left=int(info.survivors.sum()),
+        min_distance=float(info.filter.radii.min_train_distance) if info.filter else None,
+        half_length=np.log(2.0) / around.solid_density,
+        focus=around.to_user(around.focus),
+        photo_size=np.asarray(scene.cameras.sizes).max(axis=0),
         route=route_words,
         cards=cards,
         bar=bar,
-        card_columns="1fr 1fr 1.6fr" if portrait else "1fr 1fr",
-        words_place="" if portrait else "grid-column: 1 / -1;",
         place=Markup(place),
-        candidates=words.candidate_words(options, proposals, suggestion, around),
         worth_curve=Markup(plots.worth_plot(suggestion.worth, suggestion.photo_gain)),
         numbers=words.numbers(rows, poses, facts),
         command=command,
-        details=words.details(problem, options, around, quality, foggy, seconds_fn()),
+        quality=quality,
+        seconds=seconds_fn(),
     )
     worth = suggestion.worth
     summary = {

@@ -9,13 +9,11 @@ from collections.abc import Callable
 import numpy as np
 
 from bavs_jax.cameras import Cameras, take
-from bavs_jax.placement.collect import Proposals
 from bavs_jax.placement.seen import count_seeing
 from bavs_jax.scenes import Scene
 from bavs_jax.selection.worth import Worth
 from experiments.report.tables import Cell, Table, dash
-from experiments.suggest.choosing import Suggestion
-from experiments.suggest.places import Options, Surroundings
+from experiments.suggest.places import Surroundings
 
 RARE = 90.0  # percentile of the photos' pixels above which uncertainty counts as high
 NINTHS = (
@@ -25,7 +23,6 @@ NINTHS = (
 )
 GATHERED = 0.4  # share of the high pixels in one ninth of the image, to say that they are there
 ALL_AROUND = 0.25  # length of the photos' mean direction below which they have no common side
-MANY_IN_MATTER = 0.1  # share of the photos inside of "matter" from which the page warns
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,65 +170,6 @@ def worth_sentence(worth: Worth, photo_gain: float) -> str:
     return words + " There is little left to gain: this is a good place to stop."
 
 
-def headline(scene, suggestion: Suggestion, proposals: Proposals) -> str:
-    """What the page says first."""
-    num, total = len(suggestion.selected), len(proposals.poses)
-    poses = "pose" if num == 1 else "poses"
-    return (
-        f"The {num} {poses} to photograph next, chosen from {total} free places around "
-        f"{scene.num_views} photos."
-    )
-
-
-def warnings(scene, around: Surroundings, facts, foggy: int) -> list[str]:
-    """What the user should know before going there."""
-    found = []
-    if foggy > MANY_IN_MATTER * scene.num_views:
-        found.append(
-            f"{foggy} of {scene.num_views} photos stand in what the field takes for matter: it has "
-            "fog in front of the cameras, so free places are turned away too. Train longer "
-            "(--train_steps)."
-        )
-    unseen = sum(f.num_seeing == 0 for f in facts)
-    if unseen:
-        found.append(
-            f"{unseen} of {len(facts)} poses stand where no photo looks. What the field says of "
-            "such places is a guess: make sure that they are free before you send a robot there."
-        )
-    if not around.faces_focus:
-        found.append(
-            "The photos look outwards, so that they have no common point in front of them: shell "
-            "candidates look where the photos near them look."
-        )
-    return found
-
-
-def candidate_words(
-    options: Options, proposals: Proposals, suggestion: Suggestion, around: Surroundings
-) -> str:
-    """How candidates came about and how many were left."""
-    words = (
-        f"Candidates ({options.candidates}): {proposals.in_words()}. Matter: half of the light "
-        f"lost within {length(np.log(2.0) / around.solid_density * around.unit)}; clearance "
-        f"{length(around.clearance * around.unit)}."
-    )
-    if suggestion.info.filter is not None:
-        words += (
-            f" The distance filter of {options.policy!r} left "
-            f"{int(suggestion.info.survivors.sum())}, at least "
-            f"{length(float(suggestion.info.filter.radii.min_train_distance) * around.unit)} from "
-            "every photo and from each other."
-        )
-    return words
-
-
-def place_words(pose: np.ndarray) -> str:
-    """A pose as text."""
-    place = ", ".join(f"{x:.3f}" for x in pose[:3, 3])
-    look = ", ".join(f"{x:.2f}" for x in -pose[:3, 2])
-    return f"at ({place}), looks along ({look})"
-
-
 def numbers(rows, poses, facts) -> Table:
     """The table of all poses."""
     head = ("no.", "picked", "x", "y", "z", "score", "information, of the best", "high pixels")
@@ -246,24 +184,3 @@ def numbers(rows, poses, facts) -> Table:
         rest = (f"{fact.share_high:.0%}", f"{fact.nearest_distance:.3g}", str(fact.num_seeing))
         lines.append((*cells, *map(Cell, rest)))
     return Table(head, tuple(lines))
-
-
-def details(problem, options, around: Surroundings, quality, foggy, seconds) -> list[tuple]:
-    """How it was made, as pairs of name and value."""
-    scene = problem.scene
-    width, height = np.asarray(scene.cameras.sizes).max(axis=0)
-    measured = "not measured: no photo was left out (--holdout)"
-    if quality is not None:
-        measured = (
-            f"PSNR {quality['psnr']:.2f} dB, SSIM {quality['ssim']:.3f} on "
-            f"{quality['num_test_views']} photos left out"
-        )
-    focus = ", ".join(f"{x:.3f}" for x in around.to_user(around.focus))
-    return [
-        ("photos", f"{len(scene.pool)} to train on, at most {width} x {height} pixels"),
-        ("field", measured),
-        ("policy", options.policy),
-        ("focus", f"({focus}), {length(around.distance * around.unit)} from the photos (median)"),
-        ("photos inside of matter", f"{foggy} of {scene.num_views}"),
-        ("time", f"{seconds:.0f} s"),
-    ]

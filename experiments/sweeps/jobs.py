@@ -336,8 +336,10 @@ class RayEngine:
     def stop(self) -> None:
         with self._lock:
             self._stopped = True
-        for ref in list(self._running):
-            self._ray.cancel(ref, force=True)
+        if left := list(self._running):
+            for ref in left:
+                self._ray.cancel(ref, force=True)
+            self._ray.wait(left, num_returns=len(left), timeout=PATIENCE)
         self._ray.shutdown()
 
 
