@@ -18,7 +18,7 @@ from bavs_jax.placement.seen import count_seeing
 from bavs_jax.scenes.poses import user_transforms
 from bavs_jax.selection.context import SelectionError
 from bavs_jax.selection.worth import Worth
-from experiments.suggest import choosing, places, results, words
+from experiments.suggest import choosing, page, places, results
 from tests.scene_files import orbit, write_nerfstudio
 from tests.toy_scenes import toy_scene
 
@@ -139,19 +139,19 @@ def test_bearing_is_that_of_someone_who_faces_the_focus():
     scene = toy_scene()
     around = dataclasses.replace(places.look_around(scene, options()), focus=np.zeros(3))
     photos = np.array([[0.0, -3.0, 0.0]])  # stands in the south, looks north: left is west
-    assert "90° to the left" in words.bearing(np.array([-3.0, 0, 0]), photos, around, (0, 0, 1))
-    found = words.bearing(np.array([1.5, -1.5, 1.5 * math.sqrt(2)]), photos, around, (0, 0, 1))
+    assert "90° to the left" in page.bearing(np.array([-3.0, 0, 0]), photos, around, (0, 0, 1))
+    found = page.bearing(np.array([1.5, -1.5, 1.5 * math.sqrt(2)]), photos, around, (0, 0, 1))
     assert "45° to the right" in found and "45° above" in found
     all_around = np.array([[3.0, 0, 0], [-3, 0, 0], [0, 3, 0], [0, -3, 0]])
-    assert "all around" in words.bearing(np.array([1.0, 0, 0]), all_around, around, (0, 0, 1))
+    assert "all around" in page.bearing(np.array([1.0, 0, 0]), all_around, around, (0, 0, 1))
 
 
 def test_where_high_pixels_gather():
     high = np.zeros((9, 12), bool)
-    assert words.gathered_where(high) is None
+    assert page.gathered_where(high) is None
     high[7:, :3] = True
-    assert words.gathered_where(high) == "lower left"
-    assert words.gathered_where(np.ones((9, 12), bool)) is None
+    assert page.gathered_where(high) == "lower left"
+    assert page.gathered_where(np.ones((9, 12), bool)) is None
 
 
 def test_photos_see_what_is_before_them_and_not_behind_the_ball():
@@ -169,15 +169,15 @@ def test_photos_see_what_is_before_them_and_not_behind_the_ball():
 
 def test_worth_in_words():
     worth = Worth(np.array([50.0, 30.0]), np.array([60.0, 55.0, 45.0]))
-    sentence = words.worth_sentence(worth, 40.0)
+    sentence = page.worth_sentence(worth, 40.0)
     assert "75% of what the best would have told before (60 nats)" in sentence
     assert "would tell 67%" in sentence
     assert "less and less" in sentence
-    assert "good place to stop" in words.worth_sentence(worth, 44.0)
-    assert "still worth taking" in words.worth_sentence(worth, 10.0)
-    assert "no more than another photo" in words.worth_sentence(worth, 70.0)
+    assert "good place to stop" in page.worth_sentence(worth, 44.0)
+    assert "still worth taking" in page.worth_sentence(worth, 10.0)
+    assert "no more than another photo" in page.worth_sentence(worth, 70.0)
     nothing_left = Worth(np.array([60.0]), np.array([60.0, np.nan]))
-    assert "No candidate is left" in words.worth_sentence(nothing_left, 40.0)
+    assert "No candidate is left" in page.worth_sentence(nothing_left, 40.0)
 
 
 # --- files ---

@@ -29,7 +29,7 @@ from experiments.report.pictures import (
     uncertainty_limits,
 )
 from experiments.runtime import device_name, peak_memory_mb
-from experiments.suggest import plots, words
+from experiments.suggest import page
 from experiments.suggest.choosing import Suggestion, photo_rays
 from experiments.suggest.places import Options, Surroundings, photos_in_matter
 from experiments.web.page import write_template
@@ -158,9 +158,9 @@ def visiting_order(places, options: Options, last_photo) -> tuple[np.ndarray, st
     before = route_length(start, places, np.arange(len(places)))
     origin = "the last photo" if options.start is None else "the given start"
     route = (
-        f"The poses are numbered along a route of {words.length(found)} from {origin} "
+        f"The poses are numbered along a route of {page.length(found)} from {origin} "
         f"({', '.join(f'{x:.3g}' for x in start)}); in the order of picking it would be "
-        f"{words.length(before)}."
+        f"{page.length(before)}."
     )
     return order, route
 
@@ -252,7 +252,7 @@ def write_results(
     seen = render_uncertain(problem, train, jac_sq_sum, small, label)
     label = f"render {len(chosen)} previews"
     images = render_uncertain(problem, train, jac_sq_sum, picked_cameras, label)
-    facts = words.pose_facts(
+    facts = page.pose_facts(
         scene,
         around,
         picked_cameras,
@@ -260,11 +260,11 @@ def write_results(
         photo_uncertainty=np.concatenate([image["uncertainty"].ravel() for image in seen]),
         density_fn=density_fn,
     )
-    worth_words = words.worth_sentence(suggestion.worth, suggestion.photo_gain)
+    worth_words = page.worth_sentence(suggestion.worth, suggestion.photo_gain)
     cards, bar = preview_cards(images, rows, poses, facts)
     start = last_photo if options.start is None else options.start
-    place = plots.place_plot(
-        axes=plots.levelled_axes(scene.up, photos[:, :, 3], around.focus),
+    place = page.place_plot(
+        axes=page.levelled_axes(scene.up, photos[:, :, 3], around.focus),
         unit=around.unit,
         focus=around.focus,
         photos=photos,
@@ -282,7 +282,7 @@ def write_results(
         options=options,
         around=around,
         proposals=proposals,
-        length=words.length,
+        length=page.length,
         portrait=height > width,
         worth=worth_words,
         num_foggy=photos_in_matter(scene, density_fn, around),
@@ -296,8 +296,8 @@ def write_results(
         cards=cards,
         bar=bar,
         place=Markup(place),
-        worth_curve=Markup(plots.worth_plot(suggestion.worth, suggestion.photo_gain)),
-        numbers=words.numbers(rows, poses, facts),
+        worth_curve=Markup(page.worth_plot(suggestion.worth, suggestion.photo_gain)),
+        numbers=page.numbers(rows, poses, facts),
         command=command,
         quality=quality,
         seconds=seconds_fn(),
