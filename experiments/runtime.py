@@ -136,6 +136,8 @@ def given_folder(flag: str, hint: str, *, exists: bool = False) -> pathlib.Path:
         raise ConfigError(f"--{flag}: is missing; name {hint}")
     path, why = pathlib.Path(text), None
     try:
+        if "\0" in text:  # `Path.exists` says no more than that there is none
+            raise ValueError("embedded null byte")
         found = path if exists else next(p for p in (path, *path.parents) if p.exists())
         if not found.is_dir():
             why = f"{shown(str(found))} " + ("is no folder" if found.exists() else "does not exist")
