@@ -12,8 +12,6 @@ The caller loops, and so may measure, save and show progress wherever it likes. 
 from `key` and the state's counters: a run that is stopped and picked up goes the same way.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from typing import NamedTuple

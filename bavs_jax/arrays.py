@@ -1,7 +1,5 @@
 """Types of arrays, and of functions of space."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import jax

@@ -4,8 +4,6 @@ Poses use the OpenGL axes (x right, y up, the camera looks along -z) and pixel c
 integer + 0.5, so that the ray through the middle of a W x H image is pixel (W / 2, H / 2).
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -78,6 +76,13 @@ def image_pixels(width: int, height: int) -> np.ndarray:
     """Pixel centres of a whole image in row order, [H * W, 2] float32 (x, y)."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
+
+
+def view_pixels(cameras: Cameras, view_ids) -> tuple[np.ndarray, np.ndarray]:
+    """All pixels of some views, one view after another: view ids [N] and pixel centres [N, 2]."""
+    pixels = [image_pixels(int(w), int(h)) for w, h in np.asarray(cameras.sizes)[view_ids]]
+    ids = [np.full(len(centres), view, np.int32) for view, centres in zip(view_ids, pixels)]
+    return np.concatenate(ids), np.concatenate(pixels)
 
 
 # --- points to pixels ----------------------------------------------------------------------------
@@ -179,8 +184,6 @@ def hemisphere_poses(key, num: int, *, centre, radius: float, up=(0.0, 0.0, 1.0)
     `phi = 2 pi u`, `theta = arccos(1 - v)` with `u, v ~ U[0, 1]`, `theta` measured from `up`.
 
     Args:
-      key: random key.
-      num: how many.
       centre: [3] scene centre, scene units.
       radius: camera distance, scene units.
       up: [3] the hemisphere's pole.

@@ -1,7 +1,5 @@
 """Where candidate views come from, and how a chosen one becomes a training image."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
@@ -51,7 +49,6 @@ def dataset_candidates(scene: Scene, *, hemisphere_draws: int | None = None) -> 
     """The unused views of a scene's pool.
 
     Args:
-      scene: the scene.
       hemisphere_draws: None offers every unused view. A number draws that many poses on the
         hemisphere (Eq 14) and offers the nearest unused view of each.
     """

@@ -6,8 +6,6 @@ those of gradients and of curvature, then go over all. Functions here take `mesh
 device and leave everything as it is.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar

@@ -5,8 +5,6 @@ A direction at the angle `theta` from the optical axis lies at the radius `tan(t
 of a pinhole or opencv lens, and at the radius `theta` of a fisheye's, which holds all directions.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """Functions with a singular point, each with its value *and* gradient stated there."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

@@ -1,7 +1,5 @@
 """Random training pixels, drawn on the device from the views that a mask allows."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -83,8 +81,6 @@ def sample_pixels(
     much as any other, where over one fixed colour it explains an empty pixel for nothing.
 
     Args:
-      key: random key.
-      table: the scene's pixels.
       is_training_view: bool [V], at least one true.
       num_rays: R.
       background: b [3], which the photos are shown over; None: see `composite_colour`.

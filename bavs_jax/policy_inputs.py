@@ -1,7 +1,5 @@
 """Where a policy's numbers come from: fills a selection's `Context` with what the policy needs."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Callable, Iterator
@@ -70,7 +68,6 @@ class InputMaker:
         true_error_fn: TrueErrorFn | None = None,
     ):
         """Args:
-        toolbox: the parts of a scene.
         model_fns: from the name of an uncertainty model.
         options: how candidates are looked at.
         track: shows progress.
@@ -249,10 +246,8 @@ def _make_curvature_fn(
         of_rays, places, scale = view_rays(indices)
         of_rays["group_ids"] = places
         added = toolbox.curvature(situation.train.model, label=None, weighting=WEIGHTING, **of_rays)
-        scale = (curvature_factor(situation.num_rays, WEIGHTING) * scale).astype(np.float32)[
-            :, None, None
-        ]
-        return counts * scale * added[: len(indices)]
+        scale = (curvature_factor(situation.num_rays, WEIGHTING) * scale).astype(np.float32)
+        return counts * scale[:, None, None] * added[: len(indices)]
 
     return curvature
 
@@ -289,7 +284,6 @@ def _unmasked_shares(table: PixelTable, view_ids, sizes: np.ndarray) -> np.ndarr
     """Share of each pixel of reduced views that is trained on, [N] in [0, 1]; None where all are.
 
     Args:
-      table: the scene's pixels.
       view_ids: [n] views.
       sizes: [V, 2] width and height of the reduced images.
     """

@@ -1,7 +1,5 @@
 """How work in pieces tells how far it is; who calls it chooses what is shown of that."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any, Protocol

@@ -1,7 +1,5 @@
 """Names: checks of them, and tables that fill themselves from the modules of a package."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from collections.abc import Iterable

@@ -13,11 +13,11 @@ from absl import flags
 from ml_collections import config_flags
 
 from bavs_jax.selection.policies import POLICIES
-from experiments import compilation, job, runs, runtime
+from experiments import job, runs, runtime
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(compilation)
+runtime.define_cache_flags()
 flags.adopt_module_key_flags(job)
 config_flags.DEFINE_config_file(
     "config",
@@ -41,7 +41,7 @@ def main() -> None:
         return
     config = given_config("experiments/configs/quickstart.py")
     folder = runtime.given_folder("workdir", "a folder for the results")
-    compilation.start_cache()
+    runtime.start_cache()
     if FLAGS.end_with_stdin:
         runtime.end_with_parent()
     mesh = job.start_job()

@@ -27,8 +27,8 @@ from experiments.bench.same_numbers import (
 )
 from experiments.errors import ConfigError
 from experiments.files import write_json
-from experiments.machine import device_name, versions
 from experiments.reporting.tables import FORMATS
+from experiments.runtime import device_name, versions
 
 FLAGS = flags.FLAGS
 flags.DEFINE_string("workdir", None, "Folder for check_device.json.")

@@ -18,14 +18,14 @@ import time
 from absl import flags
 from ml_collections import config_flags
 
-from experiments import compilation, runtime, workdir
+from experiments import runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import check_views, load_config_scene
 from experiments.schema import given_config
 from experiments.uncertain.measure import measure_seed, write_summary
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(compilation)
+runtime.define_cache_flags()
 config_flags.DEFINE_config_file(
     "config",
     None,
@@ -54,7 +54,7 @@ def evaluate(config, folder: pathlib.Path, command: str) -> None:
 def main() -> None:
     config = given_config("experiments/configs/uncertainty.py")
     folder = runtime.given_folder("workdir", "a folder for the results")
-    compilation.start_cache()
+    runtime.start_cache()
     evaluate(config, folder, runtime.command_line())
 
 

@@ -128,10 +128,13 @@ def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
 
 
 @contextlib.contextmanager
-def exclusive(folder: str | os.PathLike) -> Iterator[None]:
+def exclusive(folder: str | os.PathLike, *, wait: bool = True) -> Iterator[None]:
     """Waits until no other process works in a folder, and keeps others out until the end.
 
     The lock ends with the process that holds it: one that is killed leaves none behind.
+
+    Raises:
+      WorkdirError: another process works there, if this one is not to `wait`.
     """
     if not is_first_process():
         yield
@@ -142,6 +145,11 @@ def exclusive(folder: str | os.PathLike) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
+            if not wait:
+                raise WorkdirError(
+                    f"{folder}: another process works here; wait for its end, or use another "
+                    "--workdir"
+                ) from None
             print(f"{folder}: another process works here; waiting for its end", flush=True)
             fcntl.flock(file, fcntl.LOCK_EX)
         yield

@@ -14,7 +14,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator
-from typing import Protocol, TextIO
+from typing import TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn
@@ -23,11 +23,45 @@ from rich.text import Text
 PLAIN_INTERVAL = 10.0  # seconds between two lines where there is no terminal
 
 
-class Task(Protocol):
-    """What `track` hands out."""
+class Task:
+    """What `track` hands out: counts units and seconds, and puts them in words."""
+
+    def __init__(self, total: int, description: str, unit: str, clock: Callable[[], float]):
+        self.total, self.description, self.unit, self._clock = total, description, unit, clock
+        self.done, self._numbers, self._start = 0, {}, clock()
+        self.on_advance: Callable[[int], None] = lambda n: None
 
     def advance(self, n: int = 1, **numbers: float) -> None:
         """Counts `n` more units as done and shows `numbers` until they are given again."""
+        self.done += n
+        # A new dict: the bar reads it from its own thread.
+        self._numbers = {**self._numbers, **numbers}
+        self.on_advance(n)
+
+    def seconds(self) -> float:
+        """Since the task began."""
+        return self._clock() - self._start
+
+    def state(self) -> str:
+        """Rate, elapsed and remaining time, and the current numbers."""
+        elapsed = self.seconds()
+        parts = [f"{elapsed:.0f} s elapsed"]
+        if self.done and elapsed > 0:
+            rate = self.done / elapsed
+            remaining = max(self.total - self.done, 0) / rate
+            parts = [f"{rate:.3g} {self.unit}/s", *parts, f"{remaining:.0f} s remaining"]
+        parts += [f"{name} {float(value):.4g}" for name, value in self._numbers.items()]
+        return ", ".join(parts)
+
+
+class _StateColumn(ProgressColumn):
+    """The task in words, made only when the bar is redrawn.
+
+    A number may still be on its way from the device; reading it at every step would wait for it.
+    """
+
+    def render(self, task) -> Text:
+        return Text(task.fields["own"].state())
 
 
 @contextlib.contextmanager
@@ -54,85 +88,28 @@ def track(
       A `Task`; call its `advance` as the work goes on.
     """
     stream = sys.stdout if stream is None else stream
-    meter = _Meter(total, description, unit, clock)
+    task, shown_at = Task(total, description, unit, clock), 0.0
     if stream.isatty():
-        with _bar(stream) as bar:
-            yield _BarTask(meter, bar, bar.add_task(description, total=total, meter=meter))
+        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+        with Progress(*columns, _StateColumn(), console=Console(file=stream)) as bar:
+            number = bar.add_task(description, total=total, own=task)
+            task.on_advance = lambda n: bar.advance(number, n)
+            yield task
         return
-    task = _PlainTask(meter, stream, interval)
+
+    def write_line() -> None:
+        line = f"{description}: {task.done}/{total} {unit}, {task.state()}"
+        print(line, file=stream, flush=True)
+
+    def write_sometimes(n: int) -> None:
+        nonlocal shown_at
+        # The last unit is left to the line that closes the task.
+        if task.seconds() - shown_at >= interval and task.done < total:
+            shown_at = task.seconds()
+            write_line()
+
+    task.on_advance = write_sometimes
     try:
         yield task
     finally:
-        task.write_line()
-
-
-class _Meter:
-    """Counts units and seconds, and puts them in words."""
-
-    def __init__(self, total, description, unit, clock):
-        self.total, self.description, self.unit, self.clock = total, description, unit, clock
-        self.done, self.numbers, self.start = 0, {}, clock()
-
-    def advance(self, n, numbers):
-        self.done += n
-        # A new dict: the bar reads it from its own thread.
-        self.numbers = {**self.numbers, **numbers}
-
-    def state(self) -> str:
-        """Rate, elapsed and remaining time, and the current numbers."""
-        elapsed = self.clock() - self.start
-        parts = [f"{elapsed:.0f} s elapsed"]
-        if self.done and elapsed > 0:
-            rate = self.done / elapsed
-            remaining = max(self.total - self.done, 0) / rate
-            parts = [f"{rate:.3g} {self.unit}/s", *parts, f"{remaining:.0f} s remaining"]
-        parts += [f"{name} {float(value):.4g}" for name, value in self.numbers.items()]
-        return ", ".join(parts)
-
-
-class _BarTask:
-    def __init__(self, meter, bar, task_id):
-        self._meter, self._bar, self._task_id = meter, bar, task_id
-
-    def advance(self, n: int = 1, **numbers: float) -> None:
-        self._meter.advance(n, numbers)
-        self._bar.advance(self._task_id, n)
-
-
-class _StateColumn(ProgressColumn):
-    """The meter in words, made only when the bar is redrawn.
-
-    A number may still be on its way from the device; reading it at every step would wait for it.
-    """
-
-    def render(self, task) -> Text:
-        return Text(task.fields["meter"].state())
-
-
-class _PlainTask:
-    def __init__(self, meter, stream, interval):
-        self._meter, self._stream, self._interval = meter, stream, interval
-        self._last_line = meter.start
-
-    def advance(self, n: int = 1, **numbers: float) -> None:
-        self._meter.advance(n, numbers)
-        now = self._meter.clock()
-        # The last unit is left to the line that closes the task.
-        if now - self._last_line >= self._interval and self._meter.done < self._meter.total:
-            self._last_line = now
-            self.write_line()
-
-    def write_line(self) -> None:
-        meter = self._meter
-        line = f"{meter.description}: {meter.done}/{meter.total} {meter.unit}, {meter.state()}"
-        print(line, file=self._stream, flush=True)
-
-
-def _bar(stream: TextIO) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        _StateColumn(),
-        console=Console(file=stream),
-    )
+        write_line()

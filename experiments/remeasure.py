@@ -12,11 +12,11 @@ from __future__ import annotations
 from absl import flags
 
 from bavs_jax.metrics.perceptual import NETS
-from experiments import compilation, runtime
+from experiments import runtime
 from experiments.posthoc.lpips import remeasure
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(compilation)
+runtime.define_cache_flags()
 flags.DEFINE_string("workdir", None, "Folder of experiments.active_selection or of a sweep.")
 flags.DEFINE_enum("lpips_net", "alex", [*NETS], "Network of LPIPS; alex is the usual one.")
 flags.DEFINE_list("policy", [], "Of which policies; by default all.")
@@ -25,7 +25,7 @@ flags.DEFINE_string("data_dir", "", "Folder of scenes, if it has moved since the
 
 def main() -> None:
     folder = runtime.given_folder("workdir", "the folder of an experiment", exists=True)
-    compilation.start_cache()
+    runtime.start_cache()
     options = {"policies": FLAGS.policy, "data_dir": FLAGS.data_dir}
     remeasure(folder, runtime.command_line(), lpips_net=FLAGS.lpips_net, **options)
 

@@ -29,12 +29,11 @@ from experiments.evaluate import (
 )
 from experiments.files import append_line, read_json, write_arrays, write_json
 from experiments.keys import run_key, stream_key
-from experiments.machine import device_name, peak_memory_mb, versions
-from experiments.parts import Part, is_completed, is_finished
 from experiments.progress import track
 from experiments.reporting.results import bound_words
-from experiments.runtime import warn
+from experiments.runtime import device_name, peak_memory_mb, versions, warn
 from experiments.signals import as_first_process, is_first_process
+from experiments.workdir import Part, is_completed, is_finished
 
 SCHEMA_VERSION = 1
 LOG_EVERY = 10  # training calls between two lines of metrics.jsonl

@@ -11,10 +11,10 @@ from experiments import runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import check_views, load_config_scene
 from experiments.files import exclusive
-from experiments.parts import all_parts, find_part
 from experiments.reporting.report import write_report
 from experiments.runner import Run
 from experiments.signals import is_first_process
+from experiments.workdir import all_parts, find_part
 
 
 def make_parts(

@@ -1,11 +1,15 @@
-"""Start-up of a script: compilation cache, where files are kept, one-line errors."""
+"""What the process of a script needs: flags, caches, one-line errors, and what it runs on."""
 
 from __future__ import annotations
 
 import functools
+import importlib.metadata
 import math
 import os
 import pathlib
+import platform
+import resource
+import subprocess
 import sys
 import tempfile
 import threading
@@ -17,6 +21,12 @@ from absl import app, flags, logging
 from bavs_jax.scenes.base import printable
 from experiments import signals
 from experiments.errors import USER_ERRORS, ConfigError, one_line, shown
+
+PACKAGES = ("bavs_jax", "jax", "jaxlib", "flax", "optax", "numpy")
+FLAGS = flags.FLAGS
+flags.disclaim_key_flags()  # flags that are defined here are those of the module that asks for them
+
+# --- caches ----------------------------------------------------------------------------------
 
 
 def cache_folder() -> pathlib.Path | None:
@@ -57,6 +67,36 @@ def use_compilation_cache(folder: pathlib.Path) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
+def define_cache_flags() -> None:
+    """Gives a script the flags of the compilation cache, which it keeps by default."""
+    flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
+    flags.DEFINE_string(
+        "compilation_cache_dir",
+        "",
+        "Folder of compiled programs; by default $XDG_CACHE_HOME/bavs_jax/compiled, or the same in "
+        "~/.cache.",
+    )
+
+
+def start_cache() -> None:
+    """Does what the flags of the cache say; must come before anything is compiled."""
+    if FLAGS.compilation_cache:
+        given = FLAGS.compilation_cache_dir
+        root = usable_cache(pathlib.Path(given)) if given else cache_folder()
+        if root is not None:
+            use_compilation_cache(root if given else root / "compiled")
+
+
+def cache_flags() -> list[str]:
+    """The flags of the cache for another process."""
+    given = FLAGS.compilation_cache_dir
+    directory = [f"--compilation_cache_dir={given}"] if given else []
+    return [f"--compilation_cache={FLAGS.compilation_cache}", *directory]
+
+
+# --- a script's start and end ----------------------------------------------------------------
+
+
 @functools.cache
 def warn(text: str) -> None:
     """A line on standard error, for what goes on all the same; said once."""
@@ -91,11 +131,13 @@ def given_folder(flag: str, hint: str, *, exists: bool = False) -> pathlib.Path:
     Raises:
       ConfigError: there is no name, or none of a folder that can be used.
     """
-    text = flags.FLAGS[flag].value
+    text = FLAGS[flag].value
     if not text:
         raise ConfigError(f"--{flag}: is missing; name {hint}")
     path, why = pathlib.Path(text), None
     try:
+        if "\0" in text:  # `Path.exists` says no more than that there is none
+            raise ValueError("embedded null byte")
         found = path if exists else next(p for p in (path, *path.parents) if p.exists())
         if not found.is_dir():
             why = f"{shown(str(found))} " + ("is no folder" if found.exists() else "does not exist")
@@ -110,7 +152,7 @@ def given_folder(flag: str, hint: str, *, exists: bool = False) -> pathlib.Path:
 
 def check_finite() -> None:
     """Raises ConfigError for a flag whose number is not finite, which no bounds of a flag catch."""
-    for name, value in flags.FLAGS.flag_values_dict().items():
+    for name, value in FLAGS.flag_values_dict().items():
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"--{name}: is {value}; give a finite number")
 
@@ -123,7 +165,7 @@ def run_script(main: Callable[[], None]) -> None:
 
     def parse(argv):
         try:
-            left = flags.FLAGS(argv)
+            left = FLAGS(argv)
             check_finite()
             return left
         except flags.Error as error:
@@ -153,3 +195,49 @@ def run_script(main: Callable[[], None]) -> None:
             raise
 
     app.run(without_arguments, flags_parser=parse)
+
+
+# --- what a result was made on ---------------------------------------------------------------
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that results depend on, of Python, and of this code where it is known."""
+    found = {name: importlib.metadata.version(name) for name in PACKAGES}
+    found["python"] = platform.python_version()
+    commit = code_commit()
+    return found if commit is None else found | {"commit": commit}
+
+
+def code_commit() -> str | None:
+    """The git commit of this code, `-dirty` if files differ from it; None outside of a checkout."""
+    folder = pathlib.Path(__file__).parents[1]
+    if not (folder / ".git").exists():
+        return None
+    command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=10"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def device_name() -> str:
+    """The device that JAX uses, such as `CPU, x86_64, 2 cores`."""
+    device = jax.devices()[0]
+    if device.platform != "cpu":
+        return f"{device.device_kind} x {jax.device_count()}"
+    affinity = getattr(os, "sched_getaffinity", None)
+    cores = len(affinity(0)) if affinity else os.cpu_count()
+    return f"CPU, {platform.machine()}, {cores} core{'s' if cores > 1 else ''}"
+
+
+def peak_memory_mb() -> float:
+    """Most memory of the host that this process has held so far, in units of 10^6 bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+
+
+def peak_device_memory_mb() -> float | None:
+    """Likewise of the device's own memory; None where the device is the host."""
+    stats = jax.devices()[0].memory_stats()
+    return None if stats is None else stats["peak_bytes_in_use"] / 1e6

@@ -42,47 +42,60 @@ def whole(low: int, high: int, zero: str = "", *, note: str = "") -> Option:
     """A whole number, and 0 where it has a meaning of its own; the `note` says what limits it."""
     words = f"a whole number from {low:,} to {high:,}" + (f", or 0: {zero}" if zero else "")
     words += f" ({note})" if note else ""
-
-    def fits(value):
-        return type(value) is int and (low <= value <= high or (value == 0 and bool(zero)))
-
-    return Option(words, fits)
+    return Option(words, lambda x: type(x) is int and (low <= x <= high or (x == 0 and bool(zero))))
 
 
 def number(low: float, high: float, zero: str = "", *, open_low=False, open_high=False) -> Option:
     """A finite number; `open_*` leaves its end out."""
-    least = f"above {low:g}" if open_low else f"from {low:g}"
-    most = f"below {high:g}" if open_high else f"to {high:g}"
-    words = f"a number {least} {most}" + (f", or 0: {zero}" if zero else "")
+    words = f"a number {'above' if open_low else 'from'} {low:g}"
+    words += f" {'below' if open_high else 'to'} {high:g}" + (f", or 0: {zero}" if zero else "")
 
     def fits(value):
         if type(value) not in (int, float):
             return False
-        if value == 0.0 and zero:
-            return True
         above = value > low if open_low else value >= low
-        return above and (value < high if open_high else value <= high)
+        below = value < high if open_high else value <= high
+        return (above and below) or (value == 0.0 and bool(zero))
 
     return Option(words, fits)
 
 
+def positive(high: float, zero: str = "") -> Option:
+    """A number above 0."""
+    return number(0.0, high, zero, open_low=True)
+
+
 def choice(*known: str) -> Option:
     """One of some words."""
-    words = f"one of {', '.join(repr(name) for name in known)}"
+    words = f"one of {', '.join(map(repr, known))}"
     return Option(words, lambda value: type(value) is str and value in known)
 
 
 def several(item: Option, least: int, most: int, *, distinct: bool = True) -> Option:
     """A tuple of things."""
     once = ", each once" if distinct else ""
-    words = f"a tuple of {least:,} to {most:,}{once}: {item.wanted}"
 
     def fits(values):
         if type(values) is not tuple or not least <= len(values) <= most:
             return False
         return all(map(item.fits, values)) and (not distinct or len({*values}) == len(values))
 
-    return Option(words, fits)
+    return Option(f"a tuple of {least:,} to {most:,}{once}: {item.wanted}", fits)
+
+
+def views(zero: str = "") -> Option:
+    """A count of views."""
+    return whole(1, 100_000, zero)
+
+
+def _is_seed_text(value) -> bool:
+    digits = type(value) is str and re.fullmatch("[0-9]{1,10}", value)
+    return bool(digits) and int(value) <= MAX_SEED
+
+
+def _is_pool_size(value) -> bool:
+    fits = type(value) in (int, float) and 0 <= value <= 100_000
+    return fits and (value < 1 or value == int(value))
 
 
 FLAG = Option("True or False", lambda value: type(value) is bool)
@@ -91,19 +104,22 @@ TEXT = Option(
     lambda value: type(value) is str and len(value) <= 1000 and value.isprintable(),
 )
 SEED = whole(0, MAX_SEED)
+SEED_TEXT = Option(
+    f"a whole number from 0 to {MAX_SEED:,} as text, or '': each seed its own",
+    lambda value: value == "" or _is_seed_text(value),
+)
+POOL_SIZE = Option(
+    "a share above 0 and below 1, a whole count up to 100000, or 0: as the loader sees fit",
+    _is_pool_size,
+)
 WEIGHT = number(0.0, 1e6)
 LAYERS, WIDTH, SAMPLES, RESOLUTION = whole(1, 64), whole(1, 4096), whole(1, 4096), whole(1, 65536)
+LEVELS, DEGREE, SKIP, DRAWS = whole(1, 32), whole(1, 24), whole(0, 64), whole(2, 1024)
 TABLE = whole(1, 24)  # 16 million rows
-
-
-def _is_seed_text(value) -> bool:
-    digits = type(value) is str and re.fullmatch("[0-9]{1,10}", value)
-    return bool(digits) and int(value) <= MAX_SEED
-
-
-def _views(zero: str = "") -> Option:
-    return whole(1, 100_000, zero)
-
+AUSE_VARIANTS = [
+    variant_name(of=of, error=error, pooled=pooled)
+    for of, error, pooled in itertools.product(("colour", "depth"), ERRORS, (False, True))
+]
 
 SCHEMA = {
     "loader": choice(*LOADERS, "auto"),
@@ -112,35 +128,25 @@ SCHEMA = {
     "image_size": whole(1, MAX_WIDTH, "as the files are"),
     "load.strict": FLAG,
     "load.downscale": whole(1, 1024, "as the loader sees fit"),
-    "load.pool_size": Option(
-        "a share above 0 and below 1, a whole count up to 100000, or 0: as the loader sees fit",
-        lambda value: (
-            type(value) in (int, float)
-            and 0 <= value <= 100_000
-            and (value < 1 or value == int(value))
-        ),
-    ),
+    "load.pool_size": POOL_SIZE,
     "load.test_every": whole(2, 100_000, "as the loader sees fit"),
     "load.seed": SEED,
     "load.split": choice("", *SPLITS),
     "policies": several(choice(*POLICIES), 1, len(POLICIES)),
     "seeds": several(SEED, 1, 10_000),
-    "num_initial": _views("all of the pool"),
-    "view_seed": Option(
-        f"a whole number from 0 to {MAX_SEED:,} as text, or '': each seed its own",
-        lambda value: value == "" or _is_seed_text(value),
-    ),
-    "batch_size": _views(),
+    "num_initial": views("all of the pool"),
+    "view_seed": SEED_TEXT,
+    "batch_size": views(),
     "num_rounds": whole(0, 10_000),
     "from_scratch": FLAG,
-    "num_test": _views("all"),
-    "num_test_final": _views("all"),
-    "num_pictures": _views("all"),
+    "num_test": views("all"),
+    "num_test_final": views("all"),
+    "num_pictures": views("all"),
     "lpips_net": choice("", *NETS),
     "checkpoint_seconds": number(0.0, MAX_VALUE),
     "field_kind": choice(*SAMPLERS),
     "sampler_kind": choice("", *sorted({*itertools.chain(*SAMPLERS.values())})),
-    "field.num_levels": whole(1, 32),
+    "field.num_levels": LEVELS,
     "field.coarsest": RESOLUTION,
     "field.finest": RESOLUTION,
     "field.features": whole(1, 64),
@@ -152,21 +158,21 @@ SCHEMA = {
     "field.appearance_features": whole(1, 1024, "none"),
     "nerf_mlp.depth": LAYERS,
     "nerf_mlp.width": WIDTH,
-    "nerf_mlp.skip": whole(0, 64),
-    "nerf_mlp.position_degree": whole(1, 24),
-    "nerf_mlp.direction_degree": whole(1, 24),
+    "nerf_mlp.skip": SKIP,
+    "nerf_mlp.position_degree": DEGREE,
+    "nerf_mlp.direction_degree": DEGREE,
     "mip_mlp.depth": LAYERS,
     "mip_mlp.width": WIDTH,
-    "mip_mlp.skip": whole(0, 64),
-    "mip_mlp.position_degree": whole(1, 24),
-    "mip_mlp.direction_degree": whole(1, 24),
+    "mip_mlp.skip": SKIP,
+    "mip_mlp.position_degree": DEGREE,
+    "mip_mlp.direction_degree": DEGREE,
     "mip_mlp.proposal_depth": LAYERS,
     "mip_mlp.proposal_width": WIDTH,
     "flow.condition_features": WIDTH,
     "flow.num_flows": LAYERS,
-    "flow_training.num_draws": whole(2, 1024),
+    "flow_training.num_draws": DRAWS,
     "flow_training.entropy_weight": WEIGHT,
-    "flow_training.floor": number(0.0, 1e3, open_low=True),
+    "flow_training.floor": positive(1e3),
     "coarse_to_fine.num_coarse": SAMPLES,
     "coarse_to_fine.num_fine": SAMPLES,
     "march.num_steps": whole(1, 65536),
@@ -174,8 +180,8 @@ SCHEMA = {
     "march.occupancy_resolution": whole(1, 512),
     "proposal.num_proposals": several(SAMPLES, 1, 8, distinct=False),
     "proposal.num_samples": SAMPLES,
-    "proposal.far": number(0.0, MAX_VALUE, open_low=True),
-    "proposal.num_levels": whole(1, 32),
+    "proposal.far": positive(MAX_VALUE),
+    "proposal.num_levels": LEVELS,
     "proposal.coarsest": RESOLUTION,
     "proposal.finest": several(RESOLUTION, 1, 8, distinct=False),
     "proposal.log2_table_size": TABLE,
@@ -188,42 +194,37 @@ SCHEMA = {
     "train.num_rays": whole(1, 1 << 20),
     "train.capacity": whole(1, 1 << 24),
     "train.look_ahead": whole(0, 64),
-    "train.learning_rate": number(0.0, 1.0, "what suits the field kind", open_low=True),
-    "train.final_share": number(0.0, 1.0, open_low=True),
+    "train.learning_rate": positive(1.0, "what suits the field kind"),
+    "train.final_share": positive(1.0),
     "train.warmup_steps": whole(0, 10_000_000),
-    "train.max_grad_norm": number(0.0, MAX_VALUE, "never cut", open_low=True),
+    "train.max_grad_norm": positive(MAX_VALUE, "never cut"),
     "train.adam_b2": number(0.0, 1.0, open_high=True),
-    "train.adam_eps": number(0.0, 1.0, open_low=True),
+    "train.adam_eps": positive(1.0),
     "train.penalty_weight": WEIGHT,
     "train.roughness_weight": number(0.0, MAX_VALUE),
-    "train.average_age": number(0.0, 0.5, "the last parameters", open_low=True),
+    "train.average_age": positive(0.5, "the last parameters"),
     "train.random_background": FLAG,
     "train.steps_per_call": whole(1, 100_000),
     "uncertainty.log2_cells": whole(1, MAX_LOG2_CELLS, note=GRID_MEMORY),
-    "uncertainty.prior_weight": number(0.0, 1e6, "1e-4 / (2^L)^3", open_low=True),
+    "uncertainty.prior_weight": positive(1e6, "1e-4 / (2^L)^3"),
     "uncertainty.weighting": choice(*WEIGHTINGS),
     "uncertainty.variant": choice(*VARIANTS),
     "uncertainty.scale": choice(*SCALES),
     "uncertainty.extent": choice(*EXTENTS),
-    "uncertainty.offset_cells": number(0.0, 1e3, open_low=True),
-    "uncertainty.flow_draws": whole(2, 1024),
+    "uncertainty.offset_cells": positive(1e3),
+    "uncertainty.flow_draws": DRAWS,
     "uncertainty.ensemble_size": whole(2, 64),
     "uncertainty.max_rays": whole(1, MAX_COUNT, "all"),
     "evaluation.models": several(choice(*MODELS), 1, len(MODELS)),
-    "evaluation.num_views": _views("all"),
+    "evaluation.num_views": views("all"),
     "evaluation.scale_depth": FLAG,
-    "evaluation.variant": choice(
-        *(
-            variant_name(of=of, error=error, pooled=pooled)
-            for of, error, pooled in itertools.product(("colour", "depth"), ERRORS, (False, True))
-        )
-    ),
-    "evaluation.num_interval_views": _views("all"),
+    "evaluation.variant": choice(*AUSE_VARIANTS),
+    "evaluation.num_interval_views": views("all"),
     "evaluation.num_interval_pixels": whole(1, MAX_COUNT, "all"),
     "evaluation.interval_scale": choice(*INTERVAL_SCALES),
     "candidates.source": choice("dataset", "hemisphere"),
-    "candidates.hemisphere_draws": _views(),
-    "candidates.image_scale": number(0.0, 1.0, open_low=True),
+    "candidates.hemisphere_draws": views(),
+    "candidates.image_scale": positive(1.0),
     "candidates.mode": choice("", *MODES),
     "candidates.min_train_distance": number(0.0, MAX_VALUE),
     "candidates.min_candidate_distance": number(0.0, MAX_VALUE),
@@ -258,7 +259,7 @@ def check_config(config: ConfigDict, *more: str, name: str = "config") -> Config
     Raises:
       ConfigError: the first option that cannot be used.
     """
-    values = check_options(config, SCHEMA | {option: _views("none") for option in more}, name)
+    values = check_options(config, SCHEMA | {option: views("none") for option in more}, name)
     _check_together(values, name)
     return config
 
@@ -275,17 +276,12 @@ def check_options(config: ConfigDict, schema: dict[str, Option], name: str) -> d
     for option in values:
         if option not in schema:
             raise ConfigError(f"{name}.{option}: is no option; known are {', '.join(schema)}")
-    for option, wanted in schema.items():
+    for option, (wanted, fits) in schema.items():
         if option not in values:
-            raise ConfigError(f"{name}.{option}: is missing; give {wanted.wanted}")
-        check_option(f"{name}.{option}", wanted, values[option])
+            raise ConfigError(f"{name}.{option}: is missing; give {wanted}")
+        if not fits(values[option]):
+            raise ConfigError(f"{name}.{option}: is {shown(values[option])}; give {wanted}")
     return values
-
-
-def check_option(name: str, option: Option, value) -> None:
-    """Raises ConfigError for a value that an option cannot have."""
-    if not option.fits(value):
-        raise ConfigError(f"{name}: is {shown(value)}; give {option.wanted}")
 
 
 def _check_together(values: dict, name: str) -> None:

@@ -9,6 +9,7 @@ The same command goes on with a run that was stopped; with other candidates it u
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
 import time
 
@@ -17,16 +18,16 @@ from ml_collections import config_flags
 
 from bavs_jax.scenes import LOADERS, load_scene
 from bavs_jax.scenes.pose_files import read_pose_file
-from experiments import compilation, runtime, workdir
+from experiments import runtime, workdir
 from experiments.build import build_problem
 from experiments.schema import MAX_SEED, MAX_WIDTH, check_config
-from experiments.suggest import choosing, places, results, settings, training
+from experiments.suggest import choosing, places, results
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(compilation)
+runtime.define_cache_flags()
 flags.DEFINE_string("data", None, "Folder of the capture, in any layout that can be loaded.")
 flags.DEFINE_string("workdir", None, "Folder for poses, checkpoints and report.html.")
-flags.DEFINE_integer("num_views", 10, "How many poses to propose.", 1, settings.MAX_POSES)
+flags.DEFINE_integer("num_views", 10, "How many poses to propose.", 1, places.MAX_POSES)
 flags.DEFINE_string("policy", "bavs_spread", "Acquisition policy that chooses.")
 flags.DEFINE_integer("holdout", 0, "Photos left out of training, to measure the field on.", 0)
 flags.DEFINE_enum("loader", "auto", [*LOADERS, "auto"], "Layout of the folder; auto: by its files.")
@@ -36,13 +37,13 @@ flags.DEFINE_integer(
 flags.DEFINE_integer("train_steps", 2400, "Optimiser steps of the field.", 1)
 config_flags.DEFINE_config_dict(
     "config",
-    settings.default_config(),
+    choosing.default_config(),
     "Every other option of the field and its uncertainty, as --config.name=value; they are "
     "explained in experiments/configs/base.py.",
 )
 flags.DEFINE_integer("seed", 0, "Of everything that is drawn.", 0, MAX_SEED)
-flags.DEFINE_enum("candidates", "shell", settings.KINDS, "Where a camera could stand.")
-flags.DEFINE_integer("num_candidates", 150, "Poses to choose from.", 1, settings.MAX_POSES)
+flags.DEFINE_enum("candidates", "shell", places.KINDS, "Where a camera could stand.")
+flags.DEFINE_integer("num_candidates", 150, "Poses to choose from.", 1, places.MAX_POSES)
 flags.DEFINE_string("bounds", "", "x0,y0,z0,x1,y1,z1 in user coordinates; no pose is outside.")
 flags.DEFINE_string("poses_file", "", "JSON or CSV of reachable poses, for --candidates=file.")
 flags.DEFINE_float("clearance", 0.0, "Free radius around a camera in user units; 0: 5 %.")
@@ -53,28 +54,17 @@ flags.DEFINE_bool("route", False, "Order the poses along a short route.")
 flags.DEFINE_string("start", "", "x,y,z where the route begins; default: at the last photo.")
 
 
-def read_options() -> settings.Options:
+def read_options() -> places.Options:
     """The flags as options, checked.
 
     Raises:
       PlacementError, SelectionError, SceneError: a value or a file that cannot be used.
     """
-    options = settings.Options(
-        num_views=FLAGS.num_views,
-        policy=FLAGS.policy,
-        candidates=FLAGS.candidates,
-        num_candidates=FLAGS.num_candidates,
-        bounds=settings.parse_bounds(FLAGS.bounds),
-        poses_file=FLAGS.poses_file,
-        clearance=FLAGS.clearance,
-        spread=FLAGS.spread,
-        gaze_jitter=FLAGS.gaze_jitter,
-        score_scale=FLAGS.score_scale,
-        route=FLAGS.route,
-        start=settings.parse_numbers(FLAGS.start, 3, "start"),
-        seed=FLAGS.seed,
-    )
-    settings.check_options(options)
+    given = {field.name: FLAGS[field.name].value for field in dataclasses.fields(places.Options)}
+    given["bounds"] = places.parse_bounds(FLAGS.bounds)
+    given["start"] = places.parse_numbers(FLAGS.start, 3, "start")
+    options = places.Options(**given)
+    places.check_options(options)
     if options.poses_file:
         read_pose_file(options.poses_file)  # what is wrong there shows before anything is trained
     choosing.check_policy(options.policy)
@@ -91,44 +81,34 @@ def read_config(data: pathlib.Path):
     config.loader, config.image_size = FLAGS.loader, FLAGS.image_size
     config.holdout, config.train.num_steps = FLAGS.holdout, FLAGS.train_steps
     config.candidates.image_scale = FLAGS.score_scale
-    settings.name_scene(config, data)
+    config.scene, config.data_dir = data.resolve().name, str(data.resolve().parent)
     return check_config(config, "holdout")
 
 
 def suggest_views(
-    config, data: pathlib.Path, folder: pathlib.Path, options: settings.Options
+    config, data: pathlib.Path, folder: pathlib.Path, options: places.Options
 ) -> None:
     """Trains, proposes, chooses and writes."""
     begin = time.monotonic()
     workdir.check_claim(folder, config)
     scene = load_scene(FLAGS.loader, root=data, image_size=FLAGS.image_size)
-    scene = training.all_for_training(scene, FLAGS.holdout)
+    scene = choosing.all_for_training(scene, FLAGS.holdout)
     around = places.look_around(scene, options)
     print(f"{scene.name}: {len(scene.pool)} photos to train on, {len(scene.test)} left out")
 
     problem = build_problem(config, scene)
     workdir.claim(folder, config)
     field_folder = folder / "field" / f"seed_{options.seed}"
-    train = training.train_field(config, problem, field_folder, options.seed)
-    jac_sq_sum = training.photo_curvature(problem, train, field_folder, options.seed)
-    quality = training.holdout_quality(problem, train)
+    train = choosing.train_field(config, problem, field_folder, options.seed)
+    jac_sq_sum = choosing.photo_curvature(problem, train, field_folder, options.seed)
+    quality = choosing.holdout_quality(problem, train)
 
     proposals = places.propose(
         scene, lambda positions: problem.density(train, positions), around, options
     )
     print(f"candidates ({options.candidates}): {proposals.in_words()}")
     cameras = places.candidate_cameras(scene, proposals.poses)
-    suggestion = choosing.suggest(
-        problem,
-        train,
-        jac_sq_sum,
-        cameras,
-        policy=options.policy,
-        num_views=options.num_views,
-        centre=around.focus,
-        scale=options.score_scale,
-        seed=options.seed,
-    )
+    suggestion = choosing.suggest(problem, train, jac_sq_sum, cameras, around.focus, options)
     files = results.write_results(
         folder,
         problem=problem,
@@ -152,7 +132,7 @@ def main() -> None:
     data = runtime.given_folder("data", "the folder of the capture", exists=True)
     folder = runtime.given_folder("workdir", "a folder for the results")
     options, config = read_options(), read_config(data)
-    compilation.start_cache()
+    runtime.start_cache()
     suggest_views(config, data, folder, options)
 
 

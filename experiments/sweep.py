@@ -7,30 +7,28 @@ An axis is `policy`, `seed` or an option of the config, such as
 --axis=config.uncertainty.log2_cells=5,6,7; each setting of options has a folder of its own, as a
 single run would make it. With --change in place of --axis, options are changed one at a time, as
 ablations do. Started again, a sweep goes on: what is finished is not run again.
+While it runs, no other sweep may start in its folder.
 """
 
 from __future__ import annotations
 
+import contextlib
 import pathlib
 import sys
 
 from absl import flags
 from ml_collections import config_flags
 
-from experiments import compilation, runtime, workdir
+from experiments import runtime, workdir
+from experiments.files import exclusive
+from experiments.progress import track
 from experiments.reporting.report import write_report
 from experiments.schema import check_config, given_config
-from experiments.sweeps import capacity
+from experiments.sweeps import jobs, plan
 from experiments.sweeps.axes import parse_axes
-from experiments.sweeps.local import LocalEngine
-from experiments.sweeps.plan import Setting, make_settings, make_trials, option_flag
-from experiments.sweeps.ray_engine import RayEngine
-from experiments.sweeps.record import Record, merged, read_record, write_record
-from experiments.sweeps.run import run_trials
-from experiments.sweeps.schedule import Engine
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(compilation)
+runtime.define_cache_flags()
 config_flags.DEFINE_config_file(
     "config", None, "What to run; see experiments.active_selection.", lock_config=True
 )
@@ -51,26 +49,25 @@ flags.DEFINE_string("ray_address", None, "ray: the cluster; the one this machine
 flags.DEFINE_integer("retries", 2, "How often a trial is started again whose worker died.", 0)
 
 
-def make_engine() -> Engine:
+def make_engine() -> jobs.Engine:
     """The engine that the flags name."""
     if FLAGS.engine == "ray":
-        return RayEngine(FLAGS.ray_address, FLAGS.cores_per_trial)
-    slots = capacity.make_slots(
-        capacity.usable_cores(),
-        capacity.free_memory_gb(),
-        capacity.visible_gpus(),
+        return jobs.RayEngine(FLAGS.ray_address, FLAGS.cores_per_trial)
+    slots = jobs.make_slots(
+        jobs.usable_cores(),
+        jobs.free_memory_gb(),
+        jobs.visible_gpus(),
         jobs=FLAGS.jobs,
         cores_per_trial=FLAGS.cores_per_trial,
         gb_per_trial=FLAGS.gb_per_trial,
     )
     print(f"{len(slots)} at a time, on cores {', '.join(str([*slot.cores]) for slot in slots)}")
-    return LocalEngine(slots)
+    return jobs.LocalEngine(slots)
 
 
-def claim_folders(settings: list[Setting], folder: pathlib.Path) -> Record:
+def claim_folders(settings: list[plan.Setting], folder: pathlib.Path) -> plan.Record:
     """Checks every setting before anything is run, and notes what the sweep is made of."""
     for setting in settings:
-        check_config(setting.config)
         workdir.check_claim(setting.folder, setting.config)
     for setting in settings:
         workdir.claim(setting.folder, setting.config)
@@ -83,12 +80,65 @@ def claim_folders(settings: list[Setting], folder: pathlib.Path) -> Record:
         }
         for s in settings
     ]
-    record = merged(read_record(folder), Record(runtime.command_line(), rows, {}))
-    write_record(folder, record)
+    now = plan.Record(runtime.command_line(), rows, {})
+    record = plan.merged(plan.read_record(folder), now)
+    plan.write_record(folder, record)
     return record
 
 
-def write_outputs(settings: list[Setting]) -> None:
+def run_trials(trials: list[plan.Trial], record: plan.Record, folder: pathlib.Path) -> int:
+    """Runs all trials and shows how far they are together; returns how many failed.
+
+    Failures are noted in the record, and struck out when they are made good.
+    """
+    by_name = {trial.job.name: trial for trial in trials}
+    counters = {
+        t.setting.name: plan.StepCounter(t.setting.folder, t.setting.config.train.num_steps)
+        for t in trials
+    }
+    running, finished, failed = set(), set(), set()
+
+    def steps_done() -> int:
+        steps = {name: counter.read() for name, counter in counters.items()}
+        done = 0
+        for name, trial in by_name.items():
+            own = steps[trial.setting.name].get(trial.part.name, 0)
+            if trial.part.policy:
+                own -= trial.setting.config.train.num_steps  # round 0 is another trial's
+            ended = name in finished or name in failed
+            done += trial.num_steps if ended else min(max(own, 0), trial.num_steps)
+        return done
+
+    def note_end(trial: plan.Trial, reason: str) -> None:
+        name = f"{trial.setting.name}/{trial.part.name}"
+        record.failed.pop(name, None)
+        if reason:
+            record.failed[name] = f"failed: {reason} (log: {trial.job.log})"
+        elif trial.part.policy:
+            workdir.collect(trial.setting.folder)
+        plan.write_record(folder, record)
+
+    shown = steps_done()
+    total = sum(trial.num_steps for trial in trials) - shown
+    events = jobs.run_jobs([t.job for t in trials], make_engine(), retries=FLAGS.retries)
+    with contextlib.closing(events), track(total, f"{len(trials)} processes", "steps") as bar:
+        for kind, job, reason in events:
+            if kind == "started":
+                running.add(job.name)
+            elif kind != "tick":
+                running.discard(job.name)
+                print(f"{job.name}: {kind}{': ' if reason else ''}{reason}", flush=True)
+            if kind in ("finished", "failed"):
+                (finished if kind == "finished" else failed).add(job.name)
+                note_end(by_name[job.name], reason)
+            done = steps_done()
+            counts = {"running": len(running), "finished": len(finished), "failed": len(failed)}
+            bar.advance(done - shown, **counts)
+            shown = done
+    return len(failed)
+
+
+def write_outputs(settings: list[plan.Setting]) -> None:
     """The summary, the exported views and the report of every setting that has a result."""
     for setting in settings:
         if not workdir.collect(setting.folder)["runs"]:
@@ -99,17 +149,15 @@ def write_outputs(settings: list[Setting]) -> None:
         print(f"report: {write_report(setting.folder)}")
 
 
-def sweep(config, folder: pathlib.Path, given: list[str]) -> int:
-    """The whole sweep; returns how many trials failed."""
-    settings = make_settings(config, parse_axes(FLAGS.axis, config, FLAGS.change), folder)
+def sweep(settings: list[plan.Setting], folder: pathlib.Path, given: list[str]) -> int:
+    """The whole sweep; `given` are the config's flags. Returns how many trials failed."""
     record = claim_folders(settings, folder)
-    trials = [t for s in settings for t in make_trials(s, given, compilation.as_flags())]
+    cache = runtime.cache_flags()
+    trials = [trial for s in settings for trial in plan.make_trials(s, given, cache)]
     planned = sum(part.policy is not None for s in settings for part in s.parts)
     left = sum(trial.part.policy is not None for trial in trials)
     print(f"trials: {planned}, finished before: {planned - left}", flush=True)
-    failed = (
-        run_trials(trials, make_engine(), record, folder, retries=FLAGS.retries) if trials else 0
-    )
+    failed = run_trials(trials, record, folder) if trials else 0
     write_outputs(settings)
     for name, reason in record.failed.items():
         print(f"{name}: {reason}")
@@ -119,10 +167,15 @@ def sweep(config, folder: pathlib.Path, given: list[str]) -> int:
 def main() -> None:
     config = given_config("experiments/configs/quickstart.py")
     folder = runtime.given_folder("workdir", "a folder for the results")
+    settings = plan.make_settings(config, parse_axes(FLAGS.axis, config, FLAGS.change), folder)
+    for setting in settings:
+        check_config(setting.config)
     flag = FLAGS["config"]
     given = [f"--config={config_flags.get_config_filename(flag)}"]
-    given += [option_flag(*item) for item in config_flags.get_override_values(flag).items()]
-    failed = sweep(config, folder, given)
+    overrides = config_flags.get_override_values(flag)
+    given += [plan.option_flag(*item) for item in overrides.items()]
+    with exclusive(folder, wait=False):
+        failed = sweep(settings, folder, given)
     if failed:
         sys.exit(f"error: {failed} trial{'s' if failed > 1 else ''} failed; reasons are above")
 

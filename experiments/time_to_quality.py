@@ -24,15 +24,14 @@ from absl import flags
 from ml_collections import config_flags
 
 from experiments import runtime
-from experiments.bench.page import quality_sections, write_page
 from experiments.bench.quality import first_seconds, measure_run, parse_targets, plateau
-from experiments.bench.results import QUALITY, quality_tables
+from experiments.bench.results import QUALITY, quality_tables, write_quality_page
 from experiments.build_scene import load_config_scene
 from experiments.configs import base
 from experiments.errors import ConfigError
 from experiments.files import write_json
-from experiments.machine import versions
 from experiments.reporting.tables import collected_text
+from experiments.runtime import versions
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS
@@ -115,8 +114,7 @@ def compare_caches(config, folder: pathlib.Path, command: str) -> None:
     }
     write_json(folder / QUALITY, result)
     page = folder / "time_to_quality.html"
-    title = f"Time to quality: {result['scene']}, {FLAGS.num_views} views"
-    write_page(page, title=title, made=result, sections=quality_sections(result))
+    write_quality_page(page, result)
     print(collected_text(quality_tables(folder / QUALITY)))
     print(f"numbers: {folder / QUALITY}")
     print(f"page:    {page}")

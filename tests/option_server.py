@@ -24,7 +24,7 @@ WORK = {
     "experiments.active_selection": ("runs.run_all", "runs.make_parts"),
     "experiments.suggest_views": ("suggest_views",),
     "experiments.evaluate_uncertainty": ("evaluate",),
-    "experiments.sweep": ("claim_folders", "make_engine"),
+    "experiments.sweep": ("sweep",),
     "experiments.tables": ("collect_all",),
     "experiments.figures": ("write_figures",),
     "experiments.remeasure": ("remeasure",),
@@ -43,17 +43,13 @@ def stop(*args, **kwargs):
 
 
 def replace_work(name: str, module) -> None:
-    """All of it but a sweep's own checks, which come with the claim of its folders."""
+    """So that a script ends where its checks do."""
     for path in WORK[name]:
         *owners, function = path.split(".")
         owner = module
         for part in owners:
             owner = getattr(owner, part)
         setattr(owner, function, stop)
-    if name == "experiments.sweep":
-        module.claim_folders = lambda settings, folder: (
-            [module.check_config(s.config) for s in settings] and stop()
-        )
 
 
 def run(name: str, module, argv: list[str]) -> dict:

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from bavs_jax.scenes import procedural
-from experiments import parts, runs, runtime, workdir
+from experiments import runs, runtime, workdir
 from experiments.errors import ReportError, WorkdirError
 from experiments.files import append_line, read_arrays, read_json, write_arrays, write_json
 from experiments.reporting.report import write_report
-from experiments.sweeps.local import StepCounter
+from experiments.sweeps.plan import StepCounter
 from experiments.trained import saved_config
 from tests.toy_runs import TINY, same_results, toy_config, toy_flags
 
@@ -267,13 +267,13 @@ def test_a_cache_on_a_full_disk_loses_no_scene(tmp_path, monkeypatch):
 
 
 def test_parts_are_finished_only_with_all_files_whole(copy):
-    part = parts.Part("bavs", "reconstruction", 0)
-    assert parts.is_finished(copy, part) and parts.is_finished(copy, part.initial)
+    part = workdir.Part("bavs", "reconstruction", 0)
+    assert workdir.is_finished(copy, part) and workdir.is_finished(copy, part.initial)
     for path in (copy / PART / "result.json", copy / "initial" / "seed_0" / "round_0.json"):
         text = path.read_text()
         path.write_text(text[: len(text) // 2])
-        assert not parts.is_finished(copy, part if "bavs" in str(path) else part.initial)
+        assert not workdir.is_finished(copy, part if "bavs" in str(path) else part.initial)
         path.write_text(text)
     result = json.loads((copy / PART / "result.json").read_text())
     write_json(copy / PART / "result.json", result | {"completed": False})
-    assert not parts.is_finished(copy, part)
+    assert not workdir.is_finished(copy, part)

@@ -26,7 +26,7 @@ from experiments.build_trainer import train_aside
 from experiments.progress import track
 from experiments.reporting.results import Run
 from experiments.reporting.run_tables import final_table
-from experiments.suggest.training import train_field
+from experiments.suggest.choosing import train_field
 from tests.toy_rounds import run_round
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene

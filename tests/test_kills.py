@@ -10,7 +10,7 @@ import threading
 import pytest
 
 from experiments import runs
-from experiments.sweeps.local import StepCounter
+from experiments.sweeps.plan import StepCounter
 from tests.file_operations import watched
 from tests.toy_runs import TINY, same_results, toy_config
 

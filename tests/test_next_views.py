@@ -14,7 +14,7 @@ from bavs_jax.scenes import load_nerfstudio
 from bavs_jax.scenes.base import Scene, photo_cameras
 from bavs_jax.scenes.poses import user_transforms
 from experiments.acquisitions import CAMERA_FIELDS, write_next_views
-from experiments.suggest.exports import write_transforms
+from experiments.suggest.results import write_transforms
 from tests.scene_files import edit_json, random_image, write_nerfstudio
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")

@@ -13,18 +13,18 @@ import pytest
 
 from bavs_jax.selection.policies import POLICIES
 from experiments.build import build_problem
-from experiments.configs.paper import table_3
+from experiments.configs.paper.protocols import PROTOCOLS, get_config
 from experiments.reporting.run_tables import PAPER
 from tests.scene_files import write_nerfstudio
 from tests.toy_runs import OVERRIDES
 from tests.toy_scenes import toy_scene
 
 ROOT = pathlib.Path(__file__).parents[1]
-SIZED = ("table_1", "table_2", "table_3", "table_4", "figure_6", "figure_7", "figure_8")
+SIZED = tuple(PROTOCOLS)
 
 
 def load(name, *size):
-    return importlib.import_module(f"experiments.configs.paper.{name}").get_config(*size)
+    return get_config(",".join([name, *size]))
 
 
 @pytest.mark.parametrize("size", ["laptop", "paper"])
@@ -76,8 +76,20 @@ def test_an_unknown_size_ends_in_one_line():
     assert "size 'big': use one of laptop, paper" in done.stderr
 
 
+@pytest.mark.parametrize("name", ["table_1", "table_2", "figure_8"])
+@pytest.mark.parametrize("size", [(), ("paper",)])
+def test_a_file_that_results_name_is_its_protocol(name, size):
+    file = importlib.import_module(f"experiments.configs.paper.{name}")
+    assert file.get_config(*size).to_dict() == load(name, *size).to_dict()
+
+
+def test_an_unknown_name_is_told_the_known_ones():
+    with pytest.raises(ValueError, match=r"name 'table_5': use one of .*table_1"):
+        get_config("table_5")
+
+
 def test_table_3_follows_its_scene():
-    config = table_3.get_config()
+    config = load("table_3")
     config.scene = "torch"
     assert config.load.split == "torch" and config.loader == "lightfield"
     config.load.split = "basket-cfnerf"
@@ -98,7 +110,7 @@ def test_table_3_runs_on_the_layout_with_true_depth(tmp_path):
     done = subprocess.run(
         [
             *(sys.executable, "-m", "experiments.evaluate_uncertainty", f"--workdir={work}"),
-            "--config=experiments/configs/paper/table_3.py",
+            "--config=experiments/configs/paper/protocols.py:table_3",
             *(f"--config.{name}={value}" for name, value in options.items()),
         ],
         capture_output=True,

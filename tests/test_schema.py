@@ -14,10 +14,11 @@ from ml_collections import ConfigDict
 from experiments import configs
 from experiments.bench.subject import check_sizes, default_sizes
 from experiments.build_scene import check_views
-from experiments.configs import base, paper, quickstart
+from experiments.configs import base, quickstart
+from experiments.configs.paper import protocols
 from experiments.errors import ConfigError
 from experiments.schema import FLAG, SCHEMA, TEXT, check_config, leaves
-from experiments.suggest.settings import default_config
+from experiments.suggest.choosing import default_config
 from experiments.sweeps.axes import MAX_TRIALS, parse_axes
 from tests.toy_runs import OVERRIDES, toy_config
 from tests.toy_scenes import toy_scene
@@ -45,13 +46,12 @@ ZERO_IS_FINE = {
 
 def all_configs():
     """(name, config) of everything in experiments/configs, in every size."""
-    for package in (configs, paper):
-        for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
-            if module.ispkg or module.name.endswith(".sizes"):
-                continue
-            get_config = importlib.import_module(module.name).get_config
-            for size in ("laptop", "paper") if get_config.__defaults__ else ("",):
-                yield f"{module.name}:{size}", get_config(*filter(None, [size]))
+    for module in pkgutil.iter_modules(configs.__path__, f"{configs.__name__}."):
+        if not module.ispkg:
+            yield module.name, importlib.import_module(module.name).get_config()
+    names = [f"{name},{size}" for name in protocols.PROTOCOLS for size in ("laptop", "paper")]
+    for name in (*protocols.FIELDS, *names):
+        yield f"protocols:{name}", protocols.get_config(name)
 
 
 def with_value(option, value, config=None):

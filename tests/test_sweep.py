@@ -3,16 +3,24 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from experiments.configs import quickstart
-from experiments.errors import ConfigError
-from experiments.files import write_arrays, write_json
+from experiments.errors import ConfigError, WorkdirError
+from experiments.files import exclusive, write_arrays, write_json
 from experiments.sweeps.axes import parse_axes, setting_name, settings
-from experiments.sweeps.plan import make_settings, make_trials
-from experiments.sweeps.record import Record, merged, read_record, write_record
+from experiments.sweeps.plan import (
+    Record,
+    make_settings,
+    make_trials,
+    merged,
+    read_record,
+    write_record,
+)
 from tests.sweep_runs import (
     attempts,
     end_of,
@@ -107,6 +115,29 @@ def test_a_run_that_was_stopped_and_killed_ends_like_an_undisturbed_one(disturbe
         assert a["selected"] == b["selected"]
         # Threads of the CPU may add up in another order.
         np.testing.assert_allclose(a["psnr"], b["psnr"], atol=1e-3)
+
+
+def test_a_second_sweep_in_the_same_folder_is_refused(tmp_path):
+    flags = [*FLAGS, f"--workdir={tmp_path}"]
+    with exclusive(tmp_path):
+        code, out = end_of(start_sweep(flags))
+    assert code == 1 and out.startswith(f"error: {tmp_path}: another process works here; ")
+    assert out.count("\n") == 1 and [*tmp_path.iterdir()] == [tmp_path / ".lock"]
+
+
+def test_a_sweep_that_is_killed_leaves_no_lock(tmp_path):
+    code = "import sys, time; from experiments.files import exclusive; "
+    code += "lock = exclusive(sys.argv[1]); lock.__enter__(); print('locked', flush=True); "
+    code += "time.sleep(100)"
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "locked\n"
+    with pytest.raises(WorkdirError, match="another process"), exclusive(tmp_path, wait=False):
+        pass
+    process.kill()
+    process.wait()
+    with exclusive(tmp_path, wait=False):
+        pass
 
 
 # --- axes, plan and record, without running anything ---

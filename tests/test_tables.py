@@ -31,7 +31,7 @@ from experiments.reporting.tables import (
     latex,
     markdown,
 )
-from experiments.sweeps.record import Record, write_record
+from experiments.sweeps.plan import Record, write_record
 from experiments.tables import MARKED, fill_page, result_tables
 from tests.report_files import make_result, write_workdir
 

@@ -1,7 +1,5 @@
 """A field on a regular grid, as a point cloud and as a surface, with its uncertainty."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 import jax
@@ -89,7 +87,6 @@ def ray_end_points(
 
     Args:
       render_fn: renders "rgb" [R, 3], "depth" and "opacity" [R] of R = `chunk` rays.
-      table: the scene's pixels.
       view_ids, pixel_ids: [N] views and numbers of the pixels (`batches.training_pixels`).
       chunk: rays of one call.
       min_opacity: of the rays that count, in [0, 1]; below it a ray mostly passes.

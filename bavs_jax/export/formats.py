@@ -1,7 +1,5 @@
 """Files of points, meshes and volumes, and the libraries that they need."""
 
-from __future__ import annotations
-
 import importlib
 import io
 from types import ModuleType
@@ -50,11 +48,7 @@ def ply_bytes(positions, rgb, properties: dict[str, np.ndarray], faces=None) -> 
         shape.vertex_attributes = attributes
     else:
         shape = trimesh.Trimesh(
-            positions,
-            faces,
-            vertex_colors=colours,
-            vertex_attributes=attributes,
-            process=False,
+            positions, faces, vertex_colors=colours, vertex_attributes=attributes, process=False
         )
     return shape.export(file_type="ply")
 

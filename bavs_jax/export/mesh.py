@@ -1,7 +1,5 @@
 """The surface of a density by marching cubes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bavs_jax.export.formats import ExportError, import_extra
@@ -13,11 +11,8 @@ WALL_SHARE = 0.01  # of the longest side of the box
 def default_threshold(box) -> float:
     """Density from which on there is matter, 1 / scene unit.
 
-    The rule: a wall as thick as 1 % of the box's longest side lets half of the light through,
-    `exp(-threshold thickness) = 1 / 2`. It does not depend on the resolution of a grid.
-
-    Args:
-      box: [2, 3] scene units.
+    The rule: a wall as thick as 1 % of the longest side of a box [2, 3] lets half of the light
+    through, `exp(-threshold thickness) = 1 / 2`. It does not depend on the resolution of a grid.
     """
     lower, upper = np.asarray(box, np.float64)
     return matter_density(WALL_SHARE * float((upper - lower).max()))
@@ -70,12 +65,7 @@ def extract_mesh(density, axes, *, threshold: float, closed: bool):
 
 
 def without_small_parts(mesh, *, min_share: float):
-    """The mesh without connected parts that have less than a share of its whole area.
-
-    Args:
-      mesh: a `trimesh.Trimesh`.
-      min_share: in [0, 1); 0 keeps everything.
-    """
+    """A `trimesh.Trimesh` without connected parts that have less than a share of its whole area."""
     trimesh = import_extra("trimesh")
     if min_share <= 0.0:
         return mesh

@@ -1,7 +1,5 @@
 """What a radiance field is: pure functions of parameters and points (Eq 1)."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple, Protocol
 
 import jax

@@ -9,8 +9,6 @@ space fills a cube and no corner of a grid is wasted:
 The box is what stays as it is, and becomes the middle half of the cube's sides.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

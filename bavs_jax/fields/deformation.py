@@ -5,8 +5,6 @@ unbounded scenes; its offsets are added to positions in world space. `theta = 0`
 posterior.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,7 +90,6 @@ def trilinear_weights(grid: DeformationGrid, positions: jax.Array, vertices: jax
     """Weight of any vertices at any positions: `b = prod_d max(0, 1 - |u_d - v_d|)`.
 
     Args:
-      grid: the grid.
       positions: [..., 3] scene units.
       vertices: [..., 3] integer coordinates, broadcast against `positions`.
 
@@ -111,7 +108,6 @@ def corner_weights(grid: DeformationGrid, cells: jax.Array, positions: jax.Array
     As `trilinear_weights`, whose hat functions of one axis are shared here by four corners.
 
     Args:
-      grid: the grid.
       cells: [I, 3] integer coordinates of each cell's lowest corner.
       positions: [J, 3] scene units.
 
@@ -139,7 +135,6 @@ def interpolate(grid: DeformationGrid, values: jax.Array, positions: jax.Array, 
     One corner after another, which a CPU does several times faster than one [..., 8] gather.
 
     Args:
-      grid: the grid.
       values: [G] one number per vertex.
       positions: [..., 3] scene units.
       power: of the trilinear weights.
@@ -161,7 +156,6 @@ def displace(grid: DeformationGrid, offsets: jax.Array, positions: jax.Array) ->
     """The offset at each position, `D_theta(x) = sum_k b_k theta_k`, [..., 3] scene units.
 
     Args:
-      grid: the grid.
       offsets: theta [G, 3], scene units.
       positions: [..., 3].
     """

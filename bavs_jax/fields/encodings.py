@@ -1,7 +1,5 @@
 """Encodings of positions and directions that let a small network fit fine detail."""
 
-from __future__ import annotations
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp

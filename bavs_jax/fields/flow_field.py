@@ -4,8 +4,6 @@ One draw from a Gaussian base, the same for all of space, is one radiance field:
 flows carry it to a density and a colour, and what is known about the point steers the flows.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple, Protocol
 
 import flax.linen as nn

@@ -4,8 +4,6 @@ Arrays hold components first, `z [D, ...]`, and any points behind them: on a CPU
 runs along the points, not along the few components of each.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import operator
@@ -121,7 +119,6 @@ def apply_flows(flows: SylvesterFlow, z: jax.Array) -> tuple[jax.Array, jax.Arra
     """All F flows in turn, every other one on reversed coordinates, so that all of them mix.
 
     Args:
-      flows: F flows.
       z: [D, ...], broadcastable against the flows' points.
 
     Returns:

@@ -1,7 +1,5 @@
 """A small, quick radiance field: a hash grid and two thin networks (Eq 1), and its proposals."""
 
-from __future__ import annotations
-
 import functools
 import math
 import operator
@@ -21,13 +19,8 @@ class HashGridField(nn.Module):
 
     Attributes:
       resolutions, features, log2_table_size: see `HashEncoding`.
-      width: units of each hidden layer.
-      geometry_features: what the density network hands to the colour network.
-      direction_degree: spherical-harmonics bands of the view direction.
-      num_views: rows of the table of appearance codes.
-      appearance_features: of each view's code; 0 for none.
-      learned_variance: whether the field also gives a variance of its colour.
       log_density: of the field before it is trained, 1 / scene unit.
+      The others are those of `make_hash_grid_field`.
     """
 
     resolutions: tuple[int, ...]

@@ -4,8 +4,6 @@ With `pixel_radius` it reads the mean encoding over the piece of a pixel's cone 
 for, as in Mip-NeRF.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import flax.linen as nn

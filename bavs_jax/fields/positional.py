@@ -1,7 +1,5 @@
 """Sines and cosines of positions, of points and of the cones behind pixels."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 
@@ -10,12 +8,7 @@ PIXEL_TO_RADIUS = 2.0 / 12.0**0.5
 
 
 def positional_encoding(x: jax.Array, degree: int) -> jax.Array:
-    """`sin(2^k pi x), cos(2^k pi x)` for k = 0 .. degree - 1 (NeRF, Eq 4), [..., 6 * degree].
-
-    Args:
-      x: [..., 3], of interest in [-1, 1].
-      degree: octaves.
-    """
+    """`sin(2^k pi x), cos(2^k pi x)` for k = 0 .. degree - 1, [..., 6 * degree] (NeRF, Eq 4)."""
     phase = _phases(x, degree)
     return jnp.concatenate([jnp.sin(phase), jnp.cos(phase)], axis=-1)
 

@@ -8,8 +8,6 @@ Papers differ in how they compute it, and a table that does not say which is wor
 choice is an argument here, and `variant_name` says which were made.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

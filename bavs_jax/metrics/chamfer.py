@@ -1,7 +1,5 @@
 """How far apart two surfaces are, both given as points spread evenly over them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -9,8 +9,6 @@ Everything is by threshold on the uncertainty, ascending, the last `+inf`: the u
 Pixels are pooled over all views, so that a view with few covered pixels weighs little.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -50,12 +48,7 @@ class PixelSums(NamedTuple):
 
 
 def is_empty(truth: np.ndarray, background) -> np.ndarray:
-    """Which true pixels show nothing but the background, [...] bool.
-
-    Args:
-      truth: [..., 3] sRGB in [0, 1].
-      background: [3] sRGB in [0, 1], or None where none is known: no pixel is empty then.
-    """
+    """Which true pixels [..., 3] show nothing but the background, [...] bool; none without one."""
     if background is None:
         return np.zeros(truth.shape[:-1], bool)
     return (np.abs(truth - np.asarray(background)) <= SAME_COLOUR).all(-1)

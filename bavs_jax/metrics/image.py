@@ -1,7 +1,5 @@
 """Image and depth measures: PSNR, SSIM and depth errors."""
 
-from __future__ import annotations
-
 import functools
 import operator
 
@@ -35,8 +33,7 @@ def psnr(prediction: Array, truth: Array, mask: Array | None = None) -> jax.Arra
     """Peak signal-to-noise ratio for a data range of 1: `-10 log10(mean (prediction - truth)^2)`.
 
     Args:
-      prediction: [..., H, W, 3] in [0, 1].
-      truth: [..., H, W, 3] in [0, 1].
+      prediction, truth: [..., H, W, 3] in [0, 1].
       mask: [..., H, W] bool, the pixels that the mean is over; None for all.
 
     Returns:
@@ -59,8 +56,7 @@ def ssim(prediction: jax.Array, truth: jax.Array) -> jax.Array:
     `C2 = 0.03^2`; averaged over channels and over the pixels whose window lies inside of the image.
 
     Args:
-      prediction: [..., H, W, 3] in [0, 1].
-      truth: [..., H, W, 3] in [0, 1].
+      prediction, truth: [..., H, W, 3] in [0, 1].
 
     Returns:
       [...] in [-1, 1]; 1 where the two are identical.
@@ -90,11 +86,7 @@ def ssim(prediction: jax.Array, truth: jax.Array) -> jax.Array:
 
 
 def measure_images(
-    prediction: Array,
-    truth: Array,
-    *,
-    mask: Array | None = None,
-    lpips_fn: LpipsFn | None = None,
+    prediction: Array, truth: Array, *, mask: Array | None = None, lpips_fn: LpipsFn | None = None
 ) -> dict[str, jax.Array | None]:
     """All image measures by the 8-bit protocol: both images are quantised, then compared.
 

@@ -1,7 +1,5 @@
 """LPIPS: how different two images look, as a trained network sees them. An optional extra."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Callable
 

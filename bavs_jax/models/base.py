@@ -4,8 +4,6 @@ A model is a bundle of pure functions. What it has learnt is in a `ModelState`, 
 and out. Fields that are sampled along rays are one kind (`ray_field.py`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Protocol
 
@@ -95,7 +93,6 @@ class RadianceModel(Protocol):
         """What R rays see (Eqs 2-3), all of it: nothing is left out for want of room.
 
         Args:
-          state: of this model.
           rays: R rays of any cameras.
           channels: more quantities to composite like colour, by name.
           displace_fn: the deformation `D(x)`.
@@ -110,7 +107,6 @@ class RadianceModel(Protocol):
         """How colour and depth change as the points that make them move (Eqs 10-13).
 
         Args:
-          state: of this model.
           rays: R rays.
           most_points: P; all R rays have at most so many by `num_points`.
           view_ids: [R] views trained on that the rays belong to; None for rays of other cameras.

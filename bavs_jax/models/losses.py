@@ -1,7 +1,5 @@
 """Losses: colour errors, and likelihoods under a variance and under draws of fields."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

@@ -4,8 +4,6 @@ An `Objective` is a pure function of a field's parameters. The samples' own loss
 penalty are added by `ray_field.py`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple, Protocol
@@ -63,7 +61,6 @@ def make_colour_objective(field: Field, *, capacity: int, mesh: Mesh | None = No
     """Mean squared colour error (Eq 5).
 
     Args:
-      field: the radiance field.
       capacity: places of each device's buffer for valid samples; a dense sampler needs none.
       mesh: devices that share the rays (see `devices.py`).
     """
@@ -99,10 +96,9 @@ def make_variance_objective(
 
     Args:
       field: one whose `apply` also returns `beta`.
-      capacity: see `make_colour_objective`.
+      capacity, mesh: see `make_colour_objective`.
       density_weight: of the mean density over all slots, which keeps empty space empty.
       through_weights: whether the geometry is moved to make U likelier too, as published.
-      mesh: see `make_colour_objective`.
     """
     render = _render_batch(field, capacity, mesh)
 
@@ -133,11 +129,9 @@ def make_flow_objective(
     """Likelihood of the colours under K draws of a distribution over fields (CF-NeRF).
 
     Args:
-      flow: the distribution over fields.
-      capacity: see `make_colour_objective`.
+      capacity, mesh: see `make_colour_objective`.
       num_draws: K, of the base, shared by all points; new ones in each step.
       entropy_weight, floor: see `flow_loss`.
-      mesh: see `make_colour_objective`.
     """
 
     def render(params, noise, batch, samples):

@@ -1,7 +1,5 @@
 """A radiance field that is sampled along rays: the paper's own kind of model (Eqs 1-5)."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from functools import partial

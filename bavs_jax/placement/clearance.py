@@ -1,7 +1,5 @@
 """Whether a camera could stand somewhere: outside of matter, clear of it, within bounds."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

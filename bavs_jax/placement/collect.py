@@ -1,7 +1,5 @@
 """Collects allowed poses from any source of draws, and counts what was turned away and why."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 
@@ -72,7 +70,6 @@ def check_enough(proposals: Proposals, num_needed: int, *, fixes: dict[str, str]
     """Raises PlacementError if there are too few poses, with the fix for the main reason.
 
     Args:
-      proposals: what was collected.
       num_needed: how many there must be.
       fixes: what helps against each of `REASONS`, and against "" where nothing was dropped.
     """

@@ -1,7 +1,5 @@
 """Draws free camera poses: in the shell around a capture's cameras, or in a box."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bavs_jax.cameras import look_at
@@ -42,7 +40,6 @@ def shell_positions(
     again.
 
     Args:
-      rng: random numbers.
       num: N, how many.
       camera_positions: [V, 3] scene units, V >= 2.
       focus: [3] what the cameras look at, scene units.

@@ -1,7 +1,5 @@
 """What free poses look at, and what they would see of it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bavs_jax.arrays import DensityFn

@@ -4,8 +4,6 @@ A coarse radiance field is rendered at stratified samples and trained on the col
 rendering; the fine field is read at these samples and at more drawn from the coarse weights.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 
@@ -20,12 +18,7 @@ PADDING = 1e-5  # weight that each coarse interval gets on top, as in NeRF
 
 
 def make_coarse_to_fine_sampler(
-    coarse: Field,
-    interval_fn: IntervalFn,
-    *,
-    background,
-    num_coarse: int = 64,
-    num_fine: int = 128,
+    coarse: Field, interval_fn: IntervalFn, *, background, num_coarse: int = 64, num_fine: int = 128
 ) -> Sampler:
     """Stratified samples, and more of them where a coarse field found weight.
 

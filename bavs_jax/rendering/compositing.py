@@ -1,7 +1,5 @@
 """Volume rendering (Eqs 2-3): densities along rays to weights, and weights to pixels."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 
@@ -22,9 +20,7 @@ def exclusive_cumsum(x: jax.Array) -> jax.Array:
 def transmittance(density: jax.Array, deltas: jax.Array) -> jax.Array:
     """Light that reaches each sample (Eq 3): `T_i = exp(-sum_{j<i} sigma_j delta_j)`, [..., S].
 
-    Args:
-      density: [..., S] >= 0, 1 / scene unit.
-      deltas: [..., S] >= 0, scene units.
+    Arguments as of `render_weights`.
     """
     return jnp.exp(-exclusive_cumsum(density * deltas))
 

@@ -3,8 +3,6 @@
 A histogram is `edges` [..., N + 1], rising, and `weights` [..., N] >= 0 of the intervals between.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 
@@ -53,12 +51,7 @@ def sample_histogram(edges: jax.Array, weights: jax.Array, places: jax.Array) ->
 
 
 def overlapping_weight(edges: jax.Array, weights: jax.Array, lower, upper) -> jax.Array:
-    """Weight of all intervals that overlap [lower, upper] (Mip-NeRF 360, Eq 12), [..., M].
-
-    Args:
-      edges, weights: the histogram, [..., N + 1] and [..., N].
-      lower, upper: [..., M].
-    """
+    """Weight of all intervals that overlap [lower, upper], all [..., M] (Mip-NeRF 360, Eq 12)."""
     starts, ends = edges[..., None, :-1], edges[..., None, 1:]
     overlaps = (starts < upper[..., None]) & (ends > lower[..., None])
     return jnp.where(overlaps, weights[..., None, :], 0.0).sum(-1)

@@ -1,7 +1,5 @@
 """Whole images and lists of pixels, in compiled chunks of fixed size."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Protocol
 
@@ -9,7 +7,7 @@ import jax
 import numpy as np
 
 from bavs_jax.arrays import Array
-from bavs_jax.cameras import Cameras, Rays, image_pixels, pixel_rays, take
+from bavs_jax.cameras import Cameras, Rays, pixel_rays, take, view_pixels
 from bavs_jax.progress import Progress, map_chunks
 
 
@@ -60,12 +58,9 @@ def render_views(
 ) -> list[dict[str, np.ndarray]]:
     """Renders whole views; each as a dict of images [H, W, ...]. Arguments as `render_pixels`."""
     sizes = np.asarray(cameras.sizes)[view_ids]
-    pixels = [image_pixels(int(w), int(h)) for w, h in sizes]
-    ids = np.concatenate([np.full(len(p), v, np.int32) for v, p in zip(view_ids, pixels)])
-    rows = render_pixels(
-        chunk_fn, cameras, ids, np.concatenate(pixels), chunk=chunk, progress_fn=progress_fn
-    )
-    ends = np.cumsum([len(p) for p in pixels])
+    ids, pixels = view_pixels(cameras, view_ids)
+    rows = render_pixels(chunk_fn, cameras, ids, pixels, chunk=chunk, progress_fn=progress_fn)
+    ends = np.cumsum(sizes.prod(axis=-1))
     return [
         {name: x[end - w * h : end].reshape(h, w, *x.shape[1:]) for name, x in rows.items()}
         for end, (w, h) in zip(ends, sizes)

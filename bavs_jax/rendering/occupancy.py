@@ -1,7 +1,5 @@
 """Which cells of the scene box hold matter: a decaying maximum of sampled densities."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -69,8 +67,6 @@ def update_occupancy(
     `min(threshold, mean)`; the mean keeps a young, thin field from vanishing.
 
     Args:
-      key: random key.
-      occupancy: the grid.
       density_fn: of the field.
       num_samples: cells looked at, drawn without regard to what they held.
       step_size: sample spacing along rays, scene units.

@@ -5,8 +5,6 @@ buffer of K places; the outputs are read back into [R, S], where all compositing
 every slot is valid there is nothing to pack, and `evaluate_dense` goes through them in order.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

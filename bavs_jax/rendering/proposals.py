@@ -1,7 +1,5 @@
 """Proposal sampling (Mip-NeRF 360, section 3): small density fields say where to look closely."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import jax

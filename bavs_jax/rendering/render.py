@@ -1,7 +1,5 @@
 """The one renderer: training, images, curvature, uncertainty and clean-up all go through it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
@@ -43,12 +41,7 @@ class RayRendering(Rendering):
 
 def basic_images(rendering: Rendering) -> dict[str, jax.Array]:
     """What every render gives: "rgb" [R, 3], "depth", "opacity" and "thinned" [R]."""
-    return {
-        "rgb": rendering.rgb,
-        "depth": rendering.depth,
-        "opacity": rendering.opacity,
-        "thinned": rendering.thinned,
-    }
+    return {name: getattr(rendering, name) for name in ("rgb", "depth", "opacity", "thinned")}
 
 
 DisplaceFn = Callable[[jax.Array], jax.Array]  # offsets [K, 3] at positions [K, 3], scene units

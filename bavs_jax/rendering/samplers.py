@@ -3,8 +3,6 @@
 The renderer, training, curvature and scoring know of no kind of sampler, only of this protocol.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 

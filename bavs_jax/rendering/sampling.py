@@ -1,7 +1,5 @@
 """Where along a ray the field is evaluated: steps through the occupied cells of the scene box."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 

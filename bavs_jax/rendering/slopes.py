@@ -1,7 +1,5 @@
 """How what a ray sees changes when the places change at which its field is read (Eq 10)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 

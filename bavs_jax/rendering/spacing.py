@@ -4,8 +4,6 @@
 in inverse distance, or even nearby and by inverse distance beyond.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Scenes: the only part of the library that opens files."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """What a scene is: posed images in one flat pixel table, with splits, box and background."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -91,7 +89,6 @@ def photo_cameras(scene: Scene, cameras: Cameras) -> Cameras:
     """Cameras as one would take photos with them: at the sizes of the scene's files.
 
     Args:
-      scene: the scene.
       cameras: with the image sizes of some of its views, which may have been reduced.
     """
     if scene.photo_sizes is None:

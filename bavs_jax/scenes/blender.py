@@ -1,7 +1,5 @@
 """Scenes in the layout of NeRF-synthetic: `transforms_{train,test}.json` and RGBA images."""
 
-from __future__ import annotations
-
 import math
 import pathlib
 
@@ -21,12 +19,7 @@ def find_depth(image_path: pathlib.Path) -> pathlib.Path | None:
 
 
 def decode_depth(values: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Distance [H, W] along the ray from an 8-bit image, `8 (1 - v / 255)`, 0 where unknown.
-
-    Args:
-      values: [H, W] uint8, 0 for the background.
-      alpha: [H, W] uint8 opacity of the colour image.
-    """
+    """Distance [H, W] along the ray, `8 (1 - v / 255)`, 0 where value or opacity, uint8, is 0."""
     depth = DEPTH_RANGE * (1.0 - values.astype(np.float32) / 255.0)
     return np.where((values > 0) & (alpha > 0), depth, np.float32(0.0))
 
@@ -88,19 +81,15 @@ def load_split(root: pathlib.Path, split: str, *, image_size, background, strict
 def load_blender(
     root, *, image_size: int | None = None, background=(1.0, 1.0, 1.0), strict: bool = False
 ) -> Scene:
-    """Loads a scene in the layout of NeRF-synthetic.
+    """Loads a scene in the layout of NeRF-synthetic, in the file's own coordinates.
 
     `transforms_train.json` gives the pool, `transforms_test.json` the test views. Where
     `<image>_depth*.png` exists it is read as the true depth.
 
     Args:
-      root: the scene's folder.
       image_size: wanted width in pixels, at most the original; the height keeps the proportion.
       background: [3] sRGB in [0, 1] to put under transparent pixels.
       strict: an image without a file is an error, not a warning.
-
-    Returns:
-      The scene, in the file's own coordinates.
 
     Raises:
       SceneError: anything in the files that cannot be used.

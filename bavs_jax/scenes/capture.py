@@ -1,7 +1,5 @@
 """From posed photographs, in whatever layout, to a scene: the part that all real captures share."""
 
-from __future__ import annotations
-
 import dataclasses
 import pathlib
 from collections.abc import Callable, Sequence
@@ -57,11 +55,10 @@ def make_scene(
 ) -> Scene:
     """Levels, centres and scales a capture's cameras, reads its images and splits its views.
 
-    Coordinates follow nerfstudio's defaults (`level_and_scale`); `Scene.user_from_scene` leads
-    back.
+    Coordinates follow nerfstudio's defaults (`level_and_scale`); +z is up, and
+    `Scene.user_from_scene` leads back.
 
     Args:
-      capture: what a reader found.
       image_size: wanted width in pixels, at most the original; of the widest image where sizes
         differ. All images are scaled by one factor.
       pool_size: views in the pool: an int for a count, a float for a share, drawn by the seed.
@@ -77,20 +74,12 @@ def make_scene(
       unbounded: whether content reaches beyond the box.
       background: [3] sRGB in [0, 1] to put under transparent pixels.
 
-    Returns:
-      The scene, with +z up.
-
     Raises:
       SceneError: anything in the files that cannot be used.
     """
     source, num_views = capture.source, len(capture.files)
     pool, test = choose_split(
-        num_views,
-        capture.split,
-        pool_size=pool_size,
-        test_every=test_every,
-        seed=seed,
-        path=source,
+        num_views, capture.split, pool_size=pool_size, test_every=test_every, seed=seed, path=source
     )
     checks.check_places(capture.poses, source)
     if scale is not None:

@@ -1,7 +1,5 @@
 """Checks on input files; every fault is a `SceneError` that names file, field and fix."""
 
-from __future__ import annotations
-
 import functools
 import math
 import os
@@ -135,12 +133,9 @@ def build_cameras(
     """`make_cameras`, of numbers that stay finite and rays that stay apart in float32.
 
     Args:
-      poses: [V, 4, 4] camera-to-world.
-      intrinsics: [V, 4] fx, fy, cx, cy in pixels.
-      sizes: [V, 2] width, height in pixels.
       names: [V] how to call the views in messages.
       path: what gives the cameras, for messages.
-      **options: of `make_cameras`.
+      poses, intrinsics, sizes, **options: of `make_cameras`, [V, 4, 4], [V, 4] and [V, 2].
 
     Raises:
       SceneError: a number that float32 cannot hold, or a focal length that is as good as 0.
@@ -161,12 +156,7 @@ def build_cameras(
 
 
 def check_places(poses: np.ndarray, path: pathlib.Path) -> None:
-    """Cameras must stand at more than one place, or nothing has a depth.
-
-    Args:
-      poses: [V, 4, 4] camera-to-world.
-      path: for messages.
-    """
+    """Cameras [V, 4, 4] must stand at more than one place, or nothing has a depth."""
     positions = np.asarray(poses)[:, :3, 3]
     spread = np.ptp(positions, axis=0).max()
     if len(positions) > 1 and spread <= ONE_PLACE * max(np.abs(positions).max(), 1.0):
@@ -218,11 +208,7 @@ def existing(files: Sequence[pathlib.Path | None]) -> dict[int, pathlib.Path]:
 
 
 def keep_existing(
-    frames: list[dict],
-    files: Sequence[pathlib.Path | None],
-    path: pathlib.Path,
-    *,
-    strict: bool,
+    frames: list[dict], files: Sequence[pathlib.Path | None], path: pathlib.Path, *, strict: bool
 ) -> list[int]:
     """Indices of the frames whose image exists; one warning counts and names the others.
 

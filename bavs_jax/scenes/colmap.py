@@ -1,7 +1,5 @@
 """Scenes as COLMAP leaves them: a sparse model, text or binary, beside folders of images."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import pathlib
@@ -139,13 +137,7 @@ def opengl_pose(image, path: pathlib.Path) -> np.ndarray:
 
 
 def read_colmap(root: pathlib.Path, *, downscale: int | None, strict: bool) -> Capture:
-    """Reads the registered images of a sparse model.
-
-    Args:
-      root: the scene's folder.
-      downscale: N takes the images of `images_N`; None those of `images`, or else the largest.
-      strict: an image without a file is an error, not a warning.
-    """
+    """Reads the registered images of a sparse model; arguments as of `load_colmap`."""
     folder, model = read_model(root)
     views = sorted((v for v in model.images.values() if v.has_pose), key=lambda view: view.name)
     if not views:
@@ -183,13 +175,7 @@ def read_colmap(root: pathlib.Path, *, downscale: int | None, strict: bool) -> C
         files=tuple(files[index] for index in kept),
         poses=np.stack(poses),
         cameras=checks.build_cameras(
-            poses,
-            intrinsics,
-            sizes,
-            names=names,
-            path=folder,
-            distortion=distortion,
-            lens=lens,
+            poses, intrinsics, sizes, names=names, path=folder, distortion=distortion, lens=lens
         ),
     )
 
@@ -212,15 +198,13 @@ def load_colmap(root, *, downscale: int | None = None, strict: bool = False, **o
 
     Of several models that of the most images; a warning names the others, and photos without a
     pose. Without any of these, that in `distorted/sparse`, with the photos in `input`.
+    The scene is in normalised coordinates with +z up.
 
     Args:
       root: the folder of `sparse` and `images`.
       downscale: N takes the images of `images_N`; None those of `images`, or else the largest.
       strict: an image without a file is an error, not a warning.
       **options: of `make_scene`.
-
-    Returns:
-      The scene, in normalised coordinates with +z up.
 
     Raises:
       SceneError: anything in the files that cannot be used.

@@ -4,8 +4,6 @@ pycolmap reads a binary file that is cut short as if nothing were wrong, or neve
 neither the file nor the line of a fault in a text file.
 """
 
-from __future__ import annotations
-
 import math
 import mmap
 import os

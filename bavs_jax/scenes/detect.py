@@ -1,7 +1,5 @@
 """What kind of scene a folder holds, by the files in it."""
 
-from __future__ import annotations
-
 import pathlib
 
 from bavs_jax.scenes import checks, nerfplusplus
@@ -35,12 +33,9 @@ def has_kind(root: pathlib.Path, kind: str) -> bool:
 
 @checks.name_refusals
 def detect_kind(root) -> str:
-    """A folder's key of `LOADERS`: the first that fits of those that say most about a scene.
+    """A scene folder's key of `LOADERS`: the first that fits of those that say most about a scene.
 
     A Light Field scene looks like the layout that it is kept in, and has to be named.
-
-    Args:
-      root: the scene's folder.
 
     Raises:
       SceneError: the folder is missing, or holds no known layout.

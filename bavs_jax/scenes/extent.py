@@ -1,7 +1,5 @@
 """Near, far and box of a capture."""
 
-from __future__ import annotations
-
 import pathlib
 
 import numpy as np
@@ -32,7 +30,6 @@ def scene_extent(
       cameras: [V] in scene coordinates.
       bounds: [V, 2] depths along the optical axis between which content lies, scene units, or
         None where they are not known.
-      path: for messages.
     """
     if bounds is None:
         box = cube(BOX_HALF_SIDE if box_half_side is None else box_half_side, path)

@@ -1,7 +1,5 @@
 """Image folders of a capture: `images` and its down-scaled copies `images_2`, `images_4`, ..."""
 
-from __future__ import annotations
-
 import pathlib
 import re
 

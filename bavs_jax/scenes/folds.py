@@ -1,7 +1,5 @@
 """Pixels at which a lens shows no direction: beyond where its distortion folds back over itself."""
 
-from __future__ import annotations
-
 import functools
 import pathlib
 
@@ -60,7 +58,6 @@ def shown_masks(
     """`shown_pixels` of each of V cameras, after a warning; None where none loses any.
 
     Args:
-      cameras: V cameras.
       names: [V] how to call the views in messages.
       path: the file that gives the lenses, for messages.
 

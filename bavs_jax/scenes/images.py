@@ -5,8 +5,6 @@ and nerfstudio read them, so their poses and intrinsics belong to the stored pix
 named in a warning (`look_over`), since poses from elsewhere may belong to the turned picture.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os
@@ -177,8 +175,6 @@ def look_over(files: Sequence[pathlib.Path], root: pathlib.Path, path: pathlib.P
     """Warns of photos that carry an EXIF orientation, and of photos that are copies of others.
 
     Args:
-      files: the photos of a scene.
-      root: the scene's folder.
       path: what gives their poses, for messages.
     """
     names = {file: os.path.relpath(file, root) for file in files}
@@ -225,14 +221,10 @@ def warn(message: str) -> None:
 
 
 def box_filter(image: np.ndarray, size: int) -> np.ndarray:
-    """Averages along the first axis over equal intervals, for any ratio, to [size, ...] float64.
+    """Averages over equal intervals of the first axis: [n, ...] to [size, ...] float64, size <= n.
 
     Output i is the mean over `[i, i + 1] n / size` of the step function that the n inputs are,
     taken as a difference of its integral.
-
-    Args:
-      image: [n, ...].
-      size: from 1 to n.
     """
     num = image.shape[0]
     if not 1 <= size <= num:

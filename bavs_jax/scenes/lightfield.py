@@ -4,8 +4,6 @@ Bayes' Rays keeps a `transforms.json`, FisherRF a COLMAP model, CF-NeRF a `poses
 NeRF++ a text file a view.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import pathlib
@@ -38,12 +36,7 @@ SPLITS = {
 NEAR, FAR = 1.0, 100.0  # units of the poses
 BOX_HALF_SIDE = 50.0  # units of the poses, where no split says it
 DOWNSCALE = 2  # at which the papers work, where the images are at hand
-LAYOUTS = (
-    "transforms.json",
-    "sparse/0/cameras.bin",
-    "poses_bounds.npy",
-    "train/pose",
-)
+LAYOUTS = ("transforms.json", "sparse/0/cameras.bin", "poses_bounds.npy", "train/pose")
 
 
 def read_any(root: pathlib.Path, *, downscale: int | None, strict: bool) -> Capture:
@@ -87,14 +80,9 @@ def true_depths(root: pathlib.Path, capture: Capture, test) -> tuple:
 
 @checks.name_refusals
 def load_lightfield(
-    root,
-    *,
-    split: str | None = None,
-    downscale: int | None = None,
-    strict: bool = False,
-    **options,
+    root, *, split: str | None = None, downscale: int | None = None, strict: bool = False, **options
 ) -> Scene:
-    """Loads a scene of the Light Field dataset.
+    """Loads a scene of the Light Field dataset, levelled and centred.
 
     Units stay those of the poses, near is 1, far 100, and the scene bounded, as in Bayes' Rays;
     but a scene in the layout of NeRF++, whose units are others, is taken for any other capture.
@@ -105,9 +93,6 @@ def load_lightfield(
       downscale: N takes the images of `images_N`; None those of `images_2` where it exists.
       strict: an image without a file is an error, not a warning.
       **options: of `make_scene`.
-
-    Returns:
-      The scene, levelled and centred.
 
     Raises:
       SceneError: anything in the files that cannot be used.

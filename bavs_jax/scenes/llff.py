@@ -1,7 +1,5 @@
 """Scenes in the layout of LLFF: `poses_bounds.npy` beside folders of images."""
 
-from __future__ import annotations
-
 import pathlib
 
 import numpy as np
@@ -43,9 +41,7 @@ def read_poses_bounds(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray, np.nd
 def read_llff(root: pathlib.Path, *, downscale: int | None) -> Capture:
     """Reads `poses_bounds.npy`, whose rows belong to the images in the order of their names.
 
-    Args:
-      root: the scene's folder.
-      downscale: N takes the images of `images_N`; None those of `images`, or else the largest.
+    Arguments as of `load_llff`.
     """
     path = root / "poses_bounds.npy"
     poses, stated, bounds = read_poses_bounds(path)

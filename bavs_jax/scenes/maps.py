@@ -1,7 +1,5 @@
 """Masks and depth maps that lie beside images."""
 
-from __future__ import annotations
-
 import functools
 import pathlib
 

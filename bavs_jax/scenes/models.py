@@ -1,7 +1,5 @@
 """Lens models by the names that files give them, and intrinsics at the size of an image."""
 
-from __future__ import annotations
-
 import pathlib
 
 from bavs_jax.scenes import checks, images

@@ -1,7 +1,5 @@
 """Scenes in the layout of NeRF++: `{train,test}/{rgb,pose,intrinsics}`, one text file a view."""
 
-from __future__ import annotations
-
 import pathlib
 
 import numpy as np

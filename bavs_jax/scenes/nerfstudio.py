@@ -1,7 +1,5 @@
 """Scenes in the layout of nerfstudio and instant-ngp: one `transforms.json` with its images."""
 
-from __future__ import annotations
-
 import functools
 import pathlib
 
@@ -74,7 +72,6 @@ def read_split(data: dict, path: pathlib.Path, names: list[str]) -> Split | None
 
     Args:
       data: the file's content.
-      path: the file.
       names: the `file_path` of each view that is kept.
 
     Raises:
@@ -170,7 +167,7 @@ def load_nerfstudio(
     original_coordinates: bool = False,
     **options,
 ) -> Scene:
-    """Loads a scene in the layout of nerfstudio.
+    """Loads a scene in the layout of nerfstudio, in normalised coordinates with +z up.
 
     `{train,val,test}_filenames` give the split where no option does. A `mask_path` is black where
     pixels are ignored; a `depth_file_path` becomes `Scene.depth`.
@@ -184,9 +181,6 @@ def load_nerfstudio(
       original_coordinates: `user_from_scene` leads back to before the file's `applied_transform`
         and `applied_scale`, rather than to the file's own poses.
       **options: of `make_scene`.
-
-    Returns:
-      The scene, in normalised coordinates with +z up.
 
     Raises:
       SceneError: anything in the files that cannot be used.

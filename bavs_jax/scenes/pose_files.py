@@ -1,7 +1,5 @@
 """Files of camera poses that a user can reach: JSON or CSV, camera-to-world with OpenGL axes."""
 
-from __future__ import annotations
-
 import csv
 import os
 import pathlib

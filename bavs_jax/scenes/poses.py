@@ -1,19 +1,12 @@
 """Poses: their conventions, and the units and the centre of a scene."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bavs_jax.scenes.base import Scene
 
 
 def user_transforms(scene: Scene, world_from_cam) -> np.ndarray:
-    """Poses in the user's coordinates, [N, 4, 4] float64.
-
-    Args:
-      scene: holds `user_from_scene` [4, 4], a similarity.
-      world_from_cam: [N, 3, 4] poses in the scene's coordinates.
-    """
+    """Poses [N, 3, 4] of the scene in the user's coordinates, [N, 4, 4] float64."""
     poses = np.tile(np.eye(4), (len(world_from_cam), 1, 1))
     poses[:, :3] = transform_poses(scene.user_from_scene, world_from_cam)
     return poses
@@ -42,14 +35,10 @@ PARALLEL = 1e-8  # sine below which two directions count as parallel
 
 
 def rotation_between(source, target) -> np.ndarray:
-    """The shortest rotation [3, 3] that turns one direction into another.
+    """The shortest rotation [3, 3] that turns one direction [3] into another.
 
     `R = I + [v] + [v]^2 / (1 + c)` with `v = source x target`, `c = source . target`; opposite
     directions turn by pi about any axis at right angles.
-
-    Args:
-      source: [3] not 0.
-      target: [3] not 0.
 
     Numerics: near opposite directions `1 + c` is `v . v / (1 - c)`, which does not cancel.
     """
@@ -98,12 +87,7 @@ def level_and_scale(poses: np.ndarray, *, scale: float | None = None) -> np.ndar
 
 
 def transform_poses(similarity: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Poses [V, 3, 4] where a similarity leads to, float64; rotations stay orthonormal.
-
-    Args:
-      similarity: [4, 4], scale times rotation and a shift.
-      poses: [V, 3 or 4, 4] camera-to-world.
-    """
+    """Poses [V, 3, 4] where a similarity [4, 4] leads to, float64; rotations stay orthonormal."""
     similarity, poses = np.asarray(similarity, np.float64), np.asarray(poses, np.float64)
     scale = np.cbrt(np.linalg.det(similarity[:3, :3]))
     moved = similarity[:3] @ np.concatenate(

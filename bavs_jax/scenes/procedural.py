@@ -1,7 +1,5 @@
 """A scene made on the spot: photographs and exact depth of the sculpture from any pose."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import json
@@ -17,7 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.arrays import Array
-from bavs_jax.cameras import Cameras, hemisphere_poses, make_cameras, pixel_rays, take
+from bavs_jax.cameras import (
+    Cameras,
+    hemisphere_poses,
+    make_cameras,
+    pixel_rays,
+    take,
+    view_pixels,
+)
 from bavs_jax.scenes import sculpture, sdf
 from bavs_jax.scenes.base import Scene, SceneError
 
@@ -121,8 +126,7 @@ def photograph(cameras: Cameras, pixels: jax.Array, t_start: jax.Array, spread: 
     opacity = hit.astype(jnp.float32).reshape(sub, num).mean(axis=0)
 
     middle = slice(sub // 2 * num, (sub // 2 + 1) * num)
-    origins = origins[0][middle], origins[1][middle], origins[2][middle]
-    directions = directions[0][middle], directions[1][middle], directions[2][middle]
+    origins, directions = ((x[middle], y[middle], z[middle]) for x, y, z in (origins, directions))
     t_before, t, hit = sdf.march(
         sculpture.distance,
         origins,
@@ -166,23 +170,16 @@ class Photos(NamedTuple):
 
 
 def capture(cameras: Cameras) -> Photos:
-    """Takes pictures of the sculpture from any poses, as an active robot would.
+    """Takes pictures of the sculpture from any poses outside of it, as an active robot would.
 
-    Args:
-      cameras: V cameras with any lens, outside of the object; sizes may differ.
+    The V cameras may have any lens; sizes may differ.
     """
     touch_fn, photograph_fn = compiled_steps()
     cameras = jax.tree.map(np.asarray, cameras)
-    sizes = np.asarray(cameras.sizes)
-    counts = sizes.prod(axis=-1)
-    view_ids = np.repeat(np.arange(len(sizes), dtype=np.int32), counts)
-    row = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    width = np.repeat(sizes[:, 0], counts)
-    centres = np.stack([row % width + 0.5, row // width + 0.5], axis=-1).astype(np.float32)
-
+    view_ids, centres = view_pixels(cameras, np.arange(len(cameras)))
     t_start, touches, spread = in_chunks(touch_fn, cameras, view_ids, [centres], CONE_CHUNK)
-    colours = np.tile(np.array(BACKGROUND, np.float32), (len(row), 1))
-    opacity, depth = np.zeros(len(row), np.float32), np.zeros(len(row), np.float32)
+    colours = np.tile(np.array(BACKGROUND, np.float32), (len(centres), 1))
+    opacity, depth = np.zeros((2, len(centres)), np.float32)
     seen = np.flatnonzero(touches)
     if len(seen):
         arrays = [centres[seen], t_start[seen], spread[seen]]
@@ -249,9 +246,6 @@ def load_procedural(
       num_test: views that are only measured; from another random key.
       cache_dir: a folder that keeps the images for the next time, or None.
       seed: draws the poses.
-
-    Returns:
-      The scene, with depth for all views.
 
     Raises:
       SceneError: a size or count below 1, a seed below 0, or more than `MAX_PIXELS` in all.

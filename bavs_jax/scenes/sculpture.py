@@ -5,8 +5,6 @@ mosaic coffers behind a striped hook, one wall with a deep pocket, and two sides
 stands on a plinth that is tiled on one half only.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 
@@ -88,12 +86,9 @@ def distance(p: Point) -> jax.Array:
 
 
 def signed_distance(points: jax.Array) -> jax.Array:
-    """Signed distance [...] to the object's surface, scene units: negative inside, 1-Lipschitz.
+    """Signed distance [...] of points [..., 3] to the surface: negative inside, 1-Lipschitz.
 
     It is a bound, not always the exact distance: cuts and unions keep it safe from above.
-
-    Args:
-      points: [..., 3] scene units.
     """
     return distance((points[..., 0], points[..., 1], points[..., 2]))
 
@@ -154,14 +149,7 @@ def paint_hook(q: Point) -> Point:
 
 def paint(q: Point) -> tuple[Colour, jax.Array]:
     """Albedo (sRGB components) and strength of the highlight, in the tower's frame."""
-    colours: list[Colour] = [
-        paint_plinth(q),
-        paint_tower(q),
-        paint_hook(q),
-        PURPLE,
-        CYAN,
-        GOLD,
-    ]
+    colours: list[Colour] = [paint_plinth(q), paint_tower(q), paint_hook(q), PURPLE, CYAN, GOLD]
     gloss = [0.05, 0.25, 0.35, 0.6, 0.6, 0.7]
     nearest, shine = jnp.full_like(q[0], jnp.inf), jnp.zeros_like(q[0])
     albedo: Colour = CREAM

@@ -5,8 +5,6 @@ axes are what CPUs vectorise. Every function here is 1-Lipschitz, `|f(p) - f(q)|
 is each combination, which is what makes sphere tracing safe.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import jax

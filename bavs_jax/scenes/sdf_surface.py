@@ -1,7 +1,5 @@
 """Points spread evenly over the surface of a signed distance field."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import jax
@@ -32,7 +30,6 @@ def project_to_surface(
     """Newton steps along the gradient, `p <- p - f grad f / |grad f|^2`.
 
     Args:
-      signed_distance: whose surface it is.
       points: [K, 3] near to the surface.
       step: of the differences that give the gradient; well below the size of what is there.
       num_steps: how many.
@@ -91,8 +88,6 @@ def sample_surface(
     is curved with a radius near to `band` the density is off by a share of about `band / radius`.
 
     Args:
-      key: random key.
-      signed_distance: whose surface it is.
       box: [2, 3] that holds the surface.
       num: N, how many points.
       band: half thickness of the shell, unit of the box.

@@ -1,7 +1,5 @@
 """Which views may be trained on, and which are only measured."""
 
-from __future__ import annotations
-
 import pathlib
 
 import numpy as np
@@ -18,7 +16,6 @@ def random_split(num_views: int, pool_size: int | float, *, seed: int, path: pat
       num_views: how many there are.
       pool_size: an int takes that many, a float in (0, 1] that share of them.
       seed: of the permutation.
-      path: for messages.
     """
     if isinstance(pool_size, float):
         num_pool = round(pool_size * num_views) if 0.0 < pool_size <= 1.0 else 0
@@ -76,12 +73,9 @@ def choose_split(
     """The split that the options ask for, or else the files' own, or else a share by the seed.
 
     Args:
-      num_views: how many views there are.
       own_split: (pool, test) that comes with the files, or None.
-      pool_size: as in `random_split`, or None.
       test_every: as `step` in `every_nth`, or None.
-      seed: as in `random_split`.
-      path: for messages.
+      num_views, pool_size, seed, path: as in `random_split`; the second may be None.
     """
     if num_views < 2:
         raise SceneError(

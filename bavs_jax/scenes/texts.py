@@ -1,7 +1,5 @@
 """Text, JSON and array files: read within bounds, so that no file costs more than it should."""
 
-from __future__ import annotations
-
 import errno
 import json
 import pathlib

@@ -1,7 +1,5 @@
 """Cameras from the frames of a `transforms.json`."""
 
-from __future__ import annotations
-
 import math
 import pathlib
 
@@ -103,12 +101,6 @@ def read_cameras(frames: list[Frame], files: list[pathlib.Path]) -> tuple[Camera
     names = [frame.own["file_path"] for frame in frames]
     lens = models.common_lens(lenses, names, frames[0].path)
     cameras = checks.build_cameras(
-        poses,
-        intrinsics,
-        sizes,
-        names=names,
-        path=frames[0].path,
-        distortion=distortion,
-        lens=lens,
+        poses, intrinsics, sizes, names=names, path=frames[0].path, distortion=distortion, lens=lens
     )
     return cameras, np.stack(poses)

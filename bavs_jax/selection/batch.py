@@ -1,7 +1,5 @@
 """From scores to a batch of views: the jitted selector and the driver of every policy."""
 
-from __future__ import annotations
-
 from typing import NamedTuple, Protocol
 
 import jax
@@ -63,14 +61,8 @@ def select_batch(
     """The paper's batch policy on given scores: max-min filter (Fig 5), then the k largest.
 
     Args:
-      scores: [C] larger is better; not NaN within `mask`.
-      positions: [C, 3] candidates, scene units.
-      mask: [C] bool with at least k set.
-      k: static, 1 .. C.
-      view_ids: [C] int, distinct.
-      training_positions: [V, 3] scene units.
-      is_training_view: [V] bool.
-      radii: where the filter begins, scene units.
+      scores, k: see `top_k`.
+      positions, mask, view_ids, training_positions, is_training_view, radii: see `max_min_filter`.
 
     Returns:
       selected [k] int from the largest score down, survivors [C] bool, `FilterInfo`.

@@ -145,10 +145,6 @@ def mark_picked(ctx: Context, index: int) -> Context:
 def score_candidates(ctx: Context, source_fn: SourceFn) -> np.ndarray:
     """Scores [C] from a source that is asked only for the candidates in `mask`; NaN elsewhere.
 
-    Args:
-      ctx: the candidates.
-      source_fn: gives the scores.
-
     Raises:
       SelectionError: if the source returns another shape than [n].
     """

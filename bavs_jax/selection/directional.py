@@ -13,8 +13,6 @@ and the picks so far. With `sharpness` 0 it is `log_det_gain` of the plain poste
 grows, looks from different sides become independent.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Distances between cameras and the maximum-minimum distance policy (Fig 5)."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax
@@ -31,12 +29,7 @@ class FilterInfo(NamedTuple):
 
 
 def pairwise_distances(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Euclidean distances `|a_n - b_m|`, [..., N, M] scene units.
-
-    Args:
-      a: [..., N, 3] scene units.
-      b: [..., M, 3] scene units.
-    """
+    """Euclidean distances `|a_n - b_m|`, [..., N, M] of points [..., N, 3] and [..., M, 3]."""
     # By differences, not |a|^2 + |b|^2 - 2 a.b: that loses near neighbours to cancellation.
     difference = a[..., :, None, :] - b[..., None, :, :]
     return jnp.sqrt(jnp.sum(difference * difference, axis=-1))
@@ -46,8 +39,7 @@ def nearest_distances(points: jax.Array, others: jax.Array, is_valid: jax.Array)
     """Distance [C] of each point to the nearest valid one of others; infinity where none is valid.
 
     Args:
-      points: [C, 3] scene units.
-      others: [V, 3] scene units.
+      points, others: [C, 3] and [V, 3], scene units.
       is_valid: [V] bool.
     """
     return masked_nearest(pairwise_distances(points, others), is_valid)
@@ -71,10 +63,8 @@ def default_radii(
     views of one pool move from the former to the latter.
 
     Args:
-      positions: [C, 3] candidates, scene units.
-      mask: [C] bool, which of them count.
-      training_positions: [V, 3] scene units.
-      is_training_view: [V] bool, which of them count.
+      positions, training_positions: [C, 3] candidates and [V, 3], scene units.
+      mask, is_training_view: [C] and [V] bool, which of them count.
       centre: [3] scene units.
     """
     cameras = jnp.concatenate([positions, training_positions])
@@ -180,12 +170,9 @@ def farthest_ranks(
     the smallest view id.
 
     Args:
-      positions: [C, 3] candidates, scene units.
-      training_positions: [V, 3] scene units.
-      is_training_view: [V] bool.
       mask: [C] bool, which candidates may be picked.
       num_picks: how many to pick; no more than `mask` has are picked.
-      view_ids: [C] int, distinct.
+      positions, training_positions, is_training_view, view_ids: see `max_min_filter`.
 
     Returns:
       [C] int32: 0 for the first pick, 1 for the next, ...; C for those never picked.

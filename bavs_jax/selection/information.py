@@ -5,8 +5,6 @@ view would add to it, the new posterior has the precision `H + h`. A view is ren
 photographed: Gauss-Newton curvature (`curvature.WEIGHTINGS`: "eq13") needs its pose alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import NamedTuple, Protocol

@@ -1,7 +1,5 @@
 """The protocol of an acquisition policy."""
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple, Protocol
 
 import jax

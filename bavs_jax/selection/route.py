@@ -1,7 +1,5 @@
 """The shortest way through chosen places: an open tour from where the camera is now."""
 
-from __future__ import annotations
-
 import numpy as np
 
 EXACT_PLACES = 12  # up to here by dynamic programming: 2^12 * 12^2 steps
@@ -36,10 +34,8 @@ def route_length(start, places, order) -> float:
 def held_karp(cost: np.ndarray) -> np.ndarray:
     """The best open tour [N] by dynamic programming over sets of visited places.
 
-    `best[S, j] = min_{i in S} best[S - j, i] + cost[i, j]`, in O(2^N N^2) time.
-
-    Args:
-      cost: [N + 1, N + 1] >= 0; row and column 0 belong to the start.
+    `best[S, j] = min_{i in S} best[S - j, i] + cost[i, j]`, in O(2^N N^2) time. Row and column 0 of
+    `cost` [N + 1, N + 1] >= 0 belong to the start.
     """
     num = len(cost) - 1
     between, from_start = cost[1:, 1:], cost[0, 1:]
@@ -78,9 +74,7 @@ def nearest_neighbour(cost: np.ndarray) -> np.ndarray:
 def improve(cost: np.ndarray, order: np.ndarray) -> np.ndarray:
     """Reverses parts of the way (2-opt) and moves runs of up to 3 places while that shortens it.
 
-    Args:
-      cost: as in `held_karp`, symmetric.
-      order: [N] int, the order to start from.
+    Begins with the order [N]; `cost` is as in `held_karp`, and symmetric.
     """
     path = [0, *(np.asarray(order) + 1).tolist()]
 

@@ -1,7 +1,5 @@
 """What is still to be gained: the best score left after each pick of a batch."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 

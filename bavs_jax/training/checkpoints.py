@@ -1,7 +1,5 @@
 """Checkpoints of a run: written atomically, at most a few kept, readable after a kill."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import logging
@@ -76,10 +74,7 @@ class Checkpoints:
     def restore(self, template) -> tuple | None:
         """The newest checkpoint that can be read as `(state, meta)`, or None if there is none.
 
-        Those that cannot be read are set aside.
-
-        Args:
-          template: gives structure, shape and dtype.
+        Those that cannot be read are set aside. `template` gives structure, shape and dtype.
         """
         for number in sorted(self._manager.all_steps(), reverse=True):
             with _without_tracebacks():

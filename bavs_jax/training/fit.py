@@ -1,7 +1,5 @@
 """The one training loop: compiled calls in turn, and a fresh start for a field that is stuck."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Training of a radiance model: state, and a compiled run of several optimiser steps (Eq 4)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Protocol

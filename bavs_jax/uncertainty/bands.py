@@ -8,8 +8,6 @@ says 0, the colour is the background's and there is no depth; counted in, these 
 half of many images and meet any level without telling anything.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -38,12 +36,7 @@ def uncertainty_of(quantity: str, image: dict) -> np.ndarray:
 
 
 def has_band(quantity: str, image: dict) -> np.ndarray:
-    """Whether each pixel [...] has a band: its ray meets something, its uncertainty is finite.
-
-    Args:
-      quantity: "colour" or "depth".
-      image: "opacity", "uncertainty" and maybe "depth_uncertainty", each [...].
-    """
+    """Whether each pixel [...] has a band: its ray meets something, its uncertainty is finite."""
     return (image["opacity"] >= MIN_OPACITY) & np.isfinite(uncertainty_of(quantity, image))
 
 

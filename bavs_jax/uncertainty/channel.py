@@ -1,7 +1,5 @@
 """Uncertainty as one more volume-rendered channel (Fig 4)."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 
@@ -63,7 +61,6 @@ def make_uncertainty_channel(
     which no photo can place, would else be more uncertain than anything that a view could settle.
 
     Args:
-      grid: the deformation grid.
       variance: [G] from `vertex_variance`.
       variant: one of `VARIANTS`.
       scale: `sigma` renders sigma over a floor of 0; `log` renders log10(sigma), sigma in

@@ -7,8 +7,6 @@ Thresholds are always on the [0, 1] form of the uncertainty, `(log10 sigma + 3) 
 `channel.py`), whatever scale is rendered and scored elsewhere. `+inf` removes nothing.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 
@@ -35,7 +33,6 @@ def make_point_uncertainty_fn(
     """Makes the uncertainty of points, in [0, 1], that thresholds are held against.
 
     Args:
-      grid: the deformation grid.
       variance: [G] from `vertex_variance`.
       variant, extent: see `make_uncertainty_channel`; with the extent `box`, what lies outside of
         the scene box is never removed.

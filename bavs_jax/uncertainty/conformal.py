@@ -22,8 +22,6 @@ what few views cost: if all views are alike, P(covered) is `level (V + 1) / V`, 
 V / (V + 1) has an infinite interval, for nothing shorter can be promised from V views.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -98,7 +96,6 @@ def half_width(calibrated: Calibrated, uncertainty, level: float) -> np.ndarray:
     """Half the length of the interval, `factor * scale(uncertainty)`, in the unit of the error.
 
     Args:
-      calibrated: of `calibrate`.
       uncertainty: [...] finite and >= 0, in the unit it had there.
       level: one of `calibrated.levels`.
 
@@ -128,7 +125,6 @@ def interval(
     """Lower and upper end of the interval around a prediction, both of its shape.
 
     Args:
-      calibrated: of `calibrate`.
       prediction: [...] as the uncertainty, or [..., channels] with one half-width for all: then the
         errors of the calibration must be the largest over the channels for all to be covered.
       uncertainty: [...] finite and >= 0.

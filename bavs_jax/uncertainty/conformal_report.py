@@ -11,8 +11,6 @@ both, even of the true scale. The interval score (Gneiting and Raftery 2007) als
 truth is outside; nothing has a lower one on average than intervals that are right at each pixel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -46,7 +44,6 @@ def coverage_report(calibrated: Calibrated, test: Sequence[ViewErrors]) -> Cover
     """Measures calibrated intervals on views of their own.
 
     Args:
-      calibrated: of `calibrate`.
       test: views that neither the field nor the scale nor the factors were learned from.
 
     Returns:

@@ -1,7 +1,5 @@
 """Views of a split, and the scale that turns an uncertainty into an error."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -8,8 +8,6 @@ For ray r, channel c, vertex v, axis d and trilinear weights b,
 No prior, factor or division is in `jac_sq_sum`; `posterior.py` adds them.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 
@@ -66,7 +64,6 @@ def vertex_squares(
     vertices of every other one are products of hat functions, so no sort is needed.
 
     Args:
-      grid: the deformation grid.
       positions: [S, 3] scene units.
       jacobian: [C, S, 3] derivative of C channels by each sample's offset.
 

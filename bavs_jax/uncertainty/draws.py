@@ -1,7 +1,5 @@
 """Scenes that the photos allow: offsets drawn from the posterior, and rendered (Fig 3)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 
@@ -19,7 +17,6 @@ def draw_offsets(key, precision: jax.Array, num: int, *, scale=1.0, limit=jnp.in
     """Offsets from the Laplace posterior, `theta = scale * n / sqrt(H)`, `n ~ N(0, 1)` (Eqs 6-9).
 
     Args:
-      key: random key.
       precision: H [G, 3] > 0, 1 / scene unit^2, from `posterior_precision`.
       num: how many draws; each is as large as `precision`, so that large grids take one at a time.
       scale: temperature, in standard deviations. At 1 the energy is the mean loss itself, as in

@@ -1,7 +1,5 @@
 """Renders of a field with measures of one's own beside colour and depth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import jax
@@ -24,7 +22,6 @@ def make_image_fn(
     """Makes the compiled renders of a kind of field, `basic_images` and further measures.
 
     Args:
-      toolbox: the parts of a scene.
       kind: a key of `toolbox.models`.
       measures_fn: the further measures, [R] each; they need a field that is sampled along rays.
     """

@@ -1,7 +1,5 @@
 """Image measures that need no posterior: entropy, disagreement, coverage and true error."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import jax
@@ -74,9 +72,8 @@ def ensemble_uncertainty(
     """Uncertainty of a ray by E fields, `mean_c Var_k(C) + (1 - mean_k sum_i w_ki)^2`.
 
     Args:
-      rgb: [E, ..., 3] in [0, 1].
-      opacity: [E, ...] in [0, 1].
-      known_background: whether an empty ray is certain; see `missing_density`.
+      rgb: see `colour_variance`.
+      opacity, known_background: see `missing_density`.
 
     Returns:
       [...] >= 0; 0 where all members see the same background and nothing else, or 1 there

@@ -1,7 +1,5 @@
 """The field and its posterior as functions of space: density, uncertainty and colour at points."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import jax
@@ -43,8 +41,6 @@ def make_point_fn(
     piece of a pixel's cone, the mean code in place of a view's.
 
     Args:
-      model: the radiance model.
-      grid: the deformation grid.
       variant: one of `channel.VARIANTS`.
       chunk: points of one compiled call.
 

@@ -1,7 +1,5 @@
 """The Laplace posterior of the deformation offsets (Eqs 6-9, 13)."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

@@ -10,8 +10,6 @@ point may be displaced (Fig 4), this says what the displacement would change: no
 even surface, much where a ray grazes an edge or ends in fog.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 
@@ -36,7 +34,6 @@ def predictive_variance(
     """`sum_c sum_vd g_rcvd^2 v_vd` of each ray.
 
     Args:
-      grid: the deformation grid.
       positions: [R, S, 3] of samples, scene units.
       jacobian: [R, C, S, 3] derivatives of C quantities by each sample's offset.
       variance: v [G, 3] of the offsets, scene unit^2.
@@ -92,7 +89,10 @@ def make_predictive_fn(
             "depth_uncertainty": deviation[1],
         }
 
-    count_fn = jit_over_rays(model.num_points, mesh, spread=(False, True))
+    def count_points(state, rays):
+        return model.num_points(state, rays)
+
+    count_fn = jit_over_rays(count_points, mesh, spread=(False, True))
     bucket_fns = {
         bucket: jit_over_rays(
             partial(render_bucket, bucket=bucket), mesh, spread=(False, False, True)

@@ -1,7 +1,5 @@
 """What a candidate view is worth: the mean of its rendered uncertainty (Eq 15)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import jax

@@ -1,7 +1,5 @@
 """Curvature over any number of rays in bounded memory: rays are grouped by their samples."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 from functools import partial
@@ -61,7 +59,6 @@ def table_rays(table: PixelTable, view_ids, pixel_ids, weighting: str) -> Curvat
     """Pixels [N] of views that are trained on, as keywords of `CurvatureOfRays`.
 
     Args:
-      table: the scene's pixels.
       view_ids, pixel_ids: [N] int, from `training_pixels`.
       weighting: one of `curvature.WEIGHTINGS`; true colours are read where it needs them.
     """
@@ -156,8 +153,6 @@ def make_curvature_fn(
     have no curvature and are not evaluated.
 
     Args:
-      model: the radiance model.
-      grid: the deformation grid.
       weighting: one of `curvature.WEIGHTINGS`.
       buckets: points a ray of each compiled shape; the model's `most_points` is added if larger.
       chunk_samples: points of one compiled call, on each device.
@@ -171,7 +166,10 @@ def make_curvature_fn(
     buckets = bucket_sizes(model, buckets)
     shards = num_shards(mesh)
 
-    count_fn = jit_over_rays(model.num_points, mesh, spread=(False, True))
+    def count_points(state, rays):
+        return model.num_points(state, rays)
+
+    count_fn = jit_over_rays(count_points, mesh, spread=(False, True))
 
     def add_part(totals, state, rows, *, bucket):
         terms = model.ray_terms(state, rows.rays, most_points=bucket, view_ids=rows.view_ids)
@@ -281,7 +279,6 @@ class CurvatureOfRays:
         """`jac_sq_sum` [G, 3], or with `group_ids` [N] that of each group, [group_size, G, 3].
 
         Args:
-          state: of the model.
           rays: N rays.
           label: of the progress; None: none is shown.
           weighting: one of `curvature.WEIGHTINGS`.

@@ -1,7 +1,5 @@
 """WarpRF (Safadoust et al. 2025): does a render agree with the training views, warped into it?"""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax

@@ -18,8 +18,8 @@ from experiments.build_scene import initial_views, load_config_scene
 from experiments.errors import ConfigError, shown
 from experiments.evaluate import evaluate_views, spread_evenly
 from experiments.keys import run_key, stream_key
-from experiments.machine import device_name
 from experiments.progress import track
+from experiments.runtime import device_name
 
 NEAR = 0.3  # dB below the plateau, from where on a field counts as done
 

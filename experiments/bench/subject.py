@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from ml_collections import ConfigDict
 
@@ -13,9 +11,8 @@ from bavs_jax.cameras import Cameras, reduced_cameras, take
 from bavs_jax.candidates import scene_hemisphere
 from bavs_jax.pixel_table import training_pixels, view_mask
 from bavs_jax.scenes import Scene
-from bavs_jax.training.fit import Trainer
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation, Toolbox
+from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
 from experiments.build import Problem, build_problem
 from experiments.build_scene import initial_views
 from experiments.build_trainer import train_aside
@@ -71,10 +68,7 @@ class Subject(NamedTuple):
 
     config: object
     problem: Problem
-    toolbox: Toolbox
-    trainer: Trainer
     is_training_view: np.ndarray  # [V] bool
-    count_samples: Callable  # (TrainState, rays [R]) -> samples of each ray [R]
 
     @property
     def scene(self) -> Scene:
@@ -98,12 +92,7 @@ def make_subject(config, scene: Scene, num_views: int) -> Subject:
     """
     problem = build_problem(changed(config, lpips_net=""), scene)
     is_training = view_mask(problem.table, initial_views(scene, SEED, num_views))
-    num_points = jax.jit(problem.model.num_points)
-
-    def count_samples(state, rays):
-        return num_points(state.model, rays)
-
-    return Subject(config, problem, problem.toolbox, problem.trainer, is_training, count_samples)
+    return Subject(config, problem, is_training)
 
 
 def train_field(subject: Subject) -> TrainState:
@@ -112,7 +101,9 @@ def train_field(subject: Subject) -> TrainState:
         None, subject.problem.table, subject.is_training_view, 0, label=subject.scene.name
     )
     key = run_key(SEED)
-    return train_aside(subject.config, subject.trainer, key, situation, RECONSTRUCTION, track)
+    return train_aside(
+        subject.config, subject.problem.trainer, key, situation, RECONSTRUCTION, track
+    )
 
 
 def draw_training_pixels(subject: Subject, num: int) -> tuple[np.ndarray, np.ndarray]:

@@ -12,10 +12,10 @@ from experiments.build_scene import load_config_scene
 from experiments.errors import ConfigError, WorkdirError
 from experiments.evaluate import measure_test_views
 from experiments.files import read_json, write_json
-from experiments.parts import is_completed
 from experiments.reporting.report import write_report
-from experiments.sweeps.record import read_record
+from experiments.sweeps.plan import read_record
 from experiments.trained import TrainedRun, field_kind, find_runs, load_run, saved_config
+from experiments.workdir import is_completed
 
 PSNR_TOLERANCE = 0.02  # dB; another machine adds up in another order
 

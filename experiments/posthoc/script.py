@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterator
 from absl import flags
 from ml_collections import config_flags
 
-from experiments import compilation, runtime, workdir
+from experiments import runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import check_views, load_config_scene
 from experiments.errors import ConfigError
 from experiments.files import write_json
-from experiments.machine import device_name, versions
+from experiments.runtime import device_name, versions
 from experiments.schema import MAX_SEED, given_config
 from experiments.trained import (
     FIRST_ROUND,
@@ -33,7 +33,7 @@ from experiments.trained import (
 SCHEMA_VERSION = 1
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(compilation)
+runtime.define_cache_flags()
 config_flags.DEFINE_config_file(
     "config",
     None,
@@ -147,7 +147,7 @@ def run_on_trained(work: Callable[[], None]) -> None:
     def main() -> None:
         given_config()
         runtime.given_folder("workdir", "the folder of a run")
-        compilation.start_cache()
+        runtime.start_cache()
         work()
 
     runtime.run_script(main)

@@ -21,8 +21,8 @@ from experiments.reporting.run_tables import (
     timing_table,
 )
 from experiments.reporting.tables import Cell, Collected, Table, interval_cell
-from experiments.sweeps.record import FILE as SWEEP_FILE
-from experiments.sweeps.record import Record, read_record
+from experiments.sweeps.plan import FILE as SWEEP_FILE
+from experiments.sweeps.plan import Record, read_record
 
 INTERVALS = "means over seeds ± half of the 95 % interval"
 

@@ -1,18 +1,23 @@
-"""Scores candidates, chooses a batch by a policy, and finds what would be left to gain."""
+"""One field on all photos of a capture, and the batch of candidates that a policy chooses by it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+import pathlib
+import time
 from functools import partial
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from bavs_jax.active import round_keys
 from bavs_jax.cameras import Cameras, num_pixels, reduced_cameras, take
 from bavs_jax.candidates import Candidates
 from bavs_jax.pixel_table import num_training_pixels, view_mask
 from bavs_jax.policy_inputs import make_candidate_curvature_fn
+from bavs_jax.scenes import Scene, SceneError
 from bavs_jax.selection.batch import SelectionInfo, acquire
 from bavs_jax.selection.context import SelectionError, make_context
 from bavs_jax.selection.information import (
@@ -24,17 +29,122 @@ from bavs_jax.selection.information import (
 )
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.selection.worth import Worth, worth_along
+from bavs_jax.training.checkpoints import Checkpoints
+from bavs_jax.training.fit import fit
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
+from bavs_jax.uncertainty.models.laplace import training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
 from bavs_jax.uncertainty.scoring import mean_uncertainty
 from experiments.build import RENDER_CHUNK, Problem
-from experiments.evaluate import spread_evenly
-from experiments.keys import stream_key
+from experiments.configs import capture
+from experiments.evaluate import evaluate_views, spread_evenly
+from experiments.files import read_arrays, write_arrays
+from experiments.keys import run_key, stream_key
 from experiments.progress import track
+from experiments.runtime import warn
+from experiments.suggest.places import Options
 
 NUM_AT_ONCE = 8  # candidates between two steps of the progress bar
 NUM_COMPARED = 8  # photos whose repetition is what new views are compared with
+
+
+# --- the field -------------------------------------------------------------------------------
+
+
+def default_config():
+    """The config of a field that is trained once on every photo of a capture."""
+    config = capture.get_config()
+    config.loader, config.image_size = "auto", 135
+    config.holdout = 0  # photos left out of training, to measure the field on
+    config.train.num_steps = 2400
+    config.lpips_net = ""
+    config.checkpoint_seconds = 20.0
+    # Every photo's rays weigh in the curvature through a uniform subset, scaled up.
+    config.uncertainty.max_rays = 40_000
+    return config
+
+
+def all_for_training(scene: Scene, holdout: int) -> Scene:
+    """The scene with every view in the pool, but for `holdout` evenly spaced ones that are only
+    measured."""
+    views = np.arange(scene.num_views, dtype=np.int32)
+    if not 0 <= holdout <= scene.num_views - 2:
+        raise SceneError(
+            f"{scene.name}: --holdout={holdout} of {scene.num_views} photos leaves fewer than 2 "
+            "to train on: give a smaller number"
+        )
+    test = spread_evenly(views, holdout) if holdout else views[:0]
+    return dataclasses.replace(scene, pool=np.setdiff1d(views, test), test=test)
+
+
+def train_field(config, problem: Problem, folder: pathlib.Path, seed: int) -> TrainState:
+    """Trains, going on from the last checkpoint in `folder`.
+
+    Raises:
+      FloatingPointError: the loss is not finite.
+    """
+    pool, steps = problem.scene.pool, config.train.steps_per_call
+    checkpoints = Checkpoints(folder / "checkpoints", warn_fn=warn)
+    train, calls, restarts = problem.trainer.init(stream_key(seed, "init")), 0, 0
+    if (found := checkpoints.restore(train)) is not None:
+        train, meta = found
+        calls, restarts = meta["calls"], meta["restarts"]
+    num_calls = problem.trainer.num_calls
+    if calls < num_calls:
+        saved_at = time.monotonic()
+        *_, key = round_keys(run_key(seed), 0)
+        with track((num_calls - calls) * steps, f"train on {len(pool)} photos", "steps") as bar:
+            for fitted in fit(
+                key,
+                problem.trainer,
+                train,
+                problem.table,
+                view_mask(problem.table, pool),
+                calls=calls,
+                restarts=restarts,
+                label="photos",
+            ):
+                train, calls, restarts, info = fitted
+                loss = float(info.loss)
+                bar.advance(steps, loss=loss, psnr=-10.0 * np.log10(loss))
+                if calls == 0:
+                    warn(f"the field is stuck: trained anew with another key ({restarts})")
+                due = time.monotonic() - saved_at > config.checkpoint_seconds
+                if due or calls == num_calls:
+                    number = restarts * (num_calls + 1) + calls
+                    checkpoints.save(number, train, {"calls": calls, "restarts": restarts})
+                    saved_at = time.monotonic()
+    checkpoints.close()
+    return train
+
+
+def photo_curvature(problem: Problem, train: TrainState, folder: pathlib.Path, seed: int):
+    """`jac_sq_sum` [G, 3] of all training photos, kept in `folder` once it is made."""
+    path = folder / "curvature.npz"
+    if (kept := read_arrays(path, "jac_sq_sum")) is not None:
+        return jnp.asarray(kept["jac_sq_sum"])
+    is_training = view_mask(problem.table, problem.scene.pool)
+    toolbox = problem.toolbox
+    situation = Situation(train, problem.table, is_training, num_rays=0, label="photos")
+    jac_sq_sum = training_curvature(
+        stream_key(seed, "photos"), toolbox, situation, weighting=toolbox.laplace.weighting
+    )
+    write_arrays(path, jac_sq_sum=np.asarray(jac_sq_sum))
+    return jac_sq_sum
+
+
+def holdout_quality(problem: Problem, train: TrainState) -> dict | None:
+    """Image measures on the photos that were left out, or None if none were."""
+    scene = problem.scene
+    if not len(scene.test):
+        return None
+    num_rays = int(np.diff(scene.offsets)[scene.test].sum())
+    with track(num_rays, f"measure on {len(scene.test)} photos left out", "rays") as bar:
+        return evaluate_views(problem.render(train), scene, scene.test, progress_fn=bar.advance)
+
+
+# --- the choice ------------------------------------------------------------------------------
 
 
 class Suggestion(NamedTuple):
@@ -57,18 +167,6 @@ def check_policy(name: str) -> None:
     else:
         return
     raise SelectionError(f"--policy: {name!r} {reason}; use another policy, such as bavs")
-
-
-def make_score_fn(problem: Problem, train: TrainState, cameras: Cameras, scale: float) -> Callable:
-    """Makes `score(jac_sq_sum, indices, progress_fn=None) -> [n]`, Eq 15 at a reduced size."""
-    num_rays = photo_rays(problem)
-
-    def score(jac_sq_sum, indices, progress_fn=None):
-        small = reduced_cameras(take(cameras, np.asarray(indices)), scale)
-        chunk_fn = problem.render(train, jac_sq_sum, num_rays)
-        return mean_uncertainty(chunk_fn, small, chunk=RENDER_CHUNK, progress_fn=progress_fn)
-
-    return score
 
 
 def photo_rays(problem: Problem) -> int:
@@ -129,42 +227,34 @@ def suggest(
     train: TrainState,
     jac_sq_sum,
     cameras: Cameras,
-    *,
-    policy: str,
-    num_views: int,
     centre,
-    scale: float,
-    seed: int,
+    options: Options,
 ) -> Suggestion:
     """Chooses `num_views` candidates and follows what the best one left would still tell.
 
     Args:
       problem, train, jac_sq_sum: the field, and the curvature of the photos.
       cameras: C candidates.
-      policy: a name in `POLICIES`.
-      num_views: k.
       centre: [3] what the photos look at, scene units.
-      scale: of candidate images, for scores.
-      seed: of policies that draw.
+      options: what the user asked for.
 
     Raises:
       SelectionError: the policy cannot choose.
     """
-    scene = problem.scene
-    score = make_score_fn(problem, train, cameras, scale)
-    num_rays = int(num_pixels(reduced_cameras(cameras, scale)).sum())
-    with track(num_rays, f"score {len(cameras)} candidates", "rays") as bar:
-        scores = score(jac_sq_sum, np.arange(len(cameras)), bar.advance)
+    scale, policy = options.score_scale, get_policy(options.policy)
+    small = reduced_cameras(cameras, scale)
+    render = problem.render(train, jac_sq_sum, photo_rays(problem))
+    with track(int(num_pixels(small).sum()), f"score {len(cameras)} candidates", "rays") as bar:
+        scores = mean_uncertainty(render, small, chunk=RENDER_CHUNK, progress_fn=bar.advance)
     information = photo_information(problem, train, jac_sq_sum, cameras, scale)
     gains = information_gains(information, len(cameras), "what candidates would tell")
 
-    chooser = get_policy(policy)
-    source_key, choose_key = jax.random.split(stream_key(seed, "choice"))
+    source_key, choose_key = jax.random.split(stream_key(options.seed, "choice"))
     situation = photo_situation(problem, train, cameras)
     fields = {"mean_uncertainty_fn": lambda rows, picked: scores[rows], "information": information}
-    if chooser.uncertainty != "laplace" or not chooser.needs <= fields.keys():
+    if policy.uncertainty != "laplace" or not policy.needs <= fields.keys():
         everyone = Candidates(cameras, np.arange(len(cameras)), np.ones(len(cameras), bool))
-        fields |= problem.inputs(chooser, source_key, situation, everyone).fields
+        fields |= problem.inputs(policy, source_key, situation, everyone).fields
     context = make_context(
         cameras.positions,
         training_positions=np.asarray(problem.table.cameras.positions),
@@ -172,7 +262,7 @@ def suggest(
         centre=centre,
         **fields,
     )
-    selected, info = acquire(chooser, choose_key, context, num_views)
+    selected, info = acquire(policy, choose_key, context, options.num_views)
 
     worth = worth_along(
         information,
@@ -181,7 +271,7 @@ def suggest(
         add_fn=add_curvature,
         score_fn=partial(candidate_gains, gain=log_det_gain),
     )
-    photos = take(scene.cameras, spread_evenly(scene.pool, NUM_COMPARED))
+    photos = take(problem.scene.cameras, spread_evenly(problem.scene.pool, NUM_COMPARED))
     again = photo_information(problem, train, jac_sq_sum, photos, scale)
     photo_gains = information_gains(again, len(photos), "what photos would tell again")
     return Suggestion(selected, scores, info, worth, float(np.median(photo_gains)))

@@ -1,10 +1,15 @@
-"""From a suggestion to its files: order, rows, exports and the page."""
+"""From a suggestion to its files: the chosen poses in several formats, numbers and the page."""
 
 from __future__ import annotations
 
+import csv
+import io
+import math
 import pathlib
 
 import numpy as np
+from markupsafe import Markup
+from scipy.spatial.transform import Rotation
 
 from bavs_jax.cameras import Cameras, num_pixels, reduced_cameras, take
 from bavs_jax.placement.collect import Proposals
@@ -13,14 +18,127 @@ from bavs_jax.scenes.base import photo_cameras
 from bavs_jax.scenes.poses import user_transforms
 from bavs_jax.selection.route import route_length, shortest_route
 from experiments.build import RENDER_CHUNK, Problem
-from experiments.files import write_json
-from experiments.machine import device_name, peak_memory_mb
+from experiments.files import write_atomic, write_json
 from experiments.progress import track
-from experiments.suggest import exports, page, plots, words
+from experiments.reporting.page import write_template
+from experiments.reporting.pictures import (
+    UNCERTAINTY_MAP,
+    colourise,
+    png_uri,
+    shrink,
+    uncertainty_limits,
+)
+from experiments.runtime import device_name, peak_memory_mb
+from experiments.suggest import page
 from experiments.suggest.choosing import Suggestion, photo_rays
-from experiments.suggest.facts import length, pose_facts
-from experiments.suggest.places import Surroundings, photos_in_matter
-from experiments.suggest.settings import Options
+from experiments.suggest.places import Options, Surroundings, photos_in_matter
+
+SECONDS_PER_VIEW = 2.0
+FPS = 24
+CSV_COLUMNS = (
+    *("order", "x", "y", "z", "qx", "qy", "qz", "qw", "look_x", "look_y", "look_z"),
+    *("score", "share_of_best", "picked"),
+)
+# By our lens: nerfstudio's camera_model, and the camera_type of its camera paths.
+LENS_NAMES = {
+    "pinhole": ("OPENCV", "perspective"),
+    "opencv": ("OPENCV", "perspective"),
+    "fisheye": ("OPENCV_FISHEYE", "fisheye"),
+}
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+MAX_SIDE = 300  # pixels of a preview
+
+
+# --- chosen poses as files: nerfstudio's transforms and camera path, and CSV ---------------------
+
+
+def write_transforms(path: pathlib.Path, poses, cameras: Cameras, rows: list[dict]) -> None:
+    """A nerfstudio `transforms.json` of views that are yet to be taken.
+
+    Args:
+      path: the file.
+      poses: [k, 4, 4] in the coordinates to write.
+      cameras: [k] their lenses and image sizes.
+      rows: [k] what else is known of each: `order`, `picked`, `score`, `share_of_best`.
+    """
+    frames = []
+    for i, row in enumerate(rows):
+        fx, fy, cx, cy = (float(x) for x in cameras.intrinsics[i])
+        width, height = (int(n) for n in cameras.sizes[i])
+        frame = {
+            "file_path": f"next/{row['order']:03d}.png",
+            "transform_matrix": np.asarray(poses[i], float).tolist(),
+            **{"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": width, "h": height},
+        }
+        distortion = np.asarray(cameras.distortion[i], float)
+        frames.append(frame | dict(zip(DISTORTION, distortion.tolist())) | row)
+    model = LENS_NAMES[cameras.lens][0]
+    write_json(path, {"camera_model": model, "frames": frames})
+
+
+def write_camera_path(path: pathlib.Path, poses, cameras: Cameras) -> None:
+    """A camera path as nerfstudio's viewer saves it: it stands at each pose in turn.
+
+    `fov` is vertical, in degrees; the path renders without lens distortion.
+    """
+    width, height = (int(n) for n in cameras.sizes[0])
+    views = []
+    for i, pose in enumerate(poses):
+        own_width, own_height = (int(n) for n in cameras.sizes[i])
+        fov = 2.0 * math.degrees(math.atan(0.5 * own_height / float(cameras.intrinsics[i, 1])))
+        matrix = np.asarray(pose, float).reshape(-1).tolist()
+        views.append({"camera_to_world": matrix, "fov": fov, "aspect": own_width / own_height})
+    value = {
+        "camera_type": LENS_NAMES[cameras.lens][1],
+        "render_height": height,
+        "render_width": width,
+        "fps": FPS,
+        "seconds": SECONDS_PER_VIEW * len(views),
+        "smoothness_value": 0.0,
+        "is_cycle": False,
+        "keyframes": [],
+        "camera_path": views,
+    }
+    write_json(path, value)
+
+
+def write_csv(path: pathlib.Path, poses, rows: list[dict]) -> None:
+    """One line per pose: place, quaternion (OpenGL axes), look direction, and what it is worth."""
+    text = io.StringIO()
+    writer = csv.writer(text)
+    writer.writerow(CSV_COLUMNS)
+    for pose, row in zip(np.asarray(poses, float), rows):
+        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()  # x, y, z, w
+        numbers = [*pose[:3, 3], *quaternion, *-pose[:3, 2], row["score"], row["share_of_best"]]
+        cells = ["" if n is None else f"{n:.9g}" for n in numbers]
+        writer.writerow([row["order"], *cells, row["picked"]])
+    write_atomic(path, lambda file: file.write(text.getvalue().encode()))
+
+
+# --- what is shown of them -------------------------------------------------------------------
+
+
+def preview_cards(images: list[dict], rows: list[dict], poses, facts) -> tuple[list, dict]:
+    """One card per pose with its render and uncertainty, and the scale of the latter."""
+    limits = uncertainty_limits([{"uncertainty": image["uncertainty"][None]} for image in images])
+    cards = []
+    for image, row, pose, fact in zip(images, rows, poses, facts):
+        rgb = np.round(255.0 * np.clip(image["rgb"], 0.0, 1.0)).astype(np.uint8)
+        uncertainty = colourise(shrink(image["uncertainty"], MAX_SIDE), *limits, UNCERTAINTY_MAP)
+        cards.append(
+            {
+                "row": row,
+                "place": pose[:3, 3],
+                "look": -pose[:3, 2],
+                "sentence": fact.sentence(),
+                "render": png_uri(shrink(rgb, MAX_SIDE)),
+                "uncertainty": png_uri(uncertainty),
+                "mean": f"{image['uncertainty'].mean():.3f}",
+            }
+        )
+    ramp = colourise(np.linspace(*limits, 256)[None], *limits, UNCERTAINTY_MAP)
+    bar = {"uri": png_uri(ramp), "low": f"≤ {limits[0]:.2f}", "high": f"≥ {limits[1]:.2f}"}
+    return cards, bar
 
 
 def visiting_order(places, options: Options, last_photo) -> tuple[np.ndarray, str]:
@@ -39,9 +157,9 @@ def visiting_order(places, options: Options, last_photo) -> tuple[np.ndarray, st
     before = route_length(start, places, np.arange(len(places)))
     origin = "the last photo" if options.start is None else "the given start"
     route = (
-        f"The poses are numbered along a route of {length(found)} from {origin} "
+        f"The poses are numbered along a route of {page.length(found)} from {origin} "
         f"({', '.join(f'{x:.3g}' for x in start)}); in the order of picking it would be "
-        f"{length(before)}."
+        f"{page.length(before)}."
     )
     return order, route
 
@@ -60,30 +178,12 @@ def make_rows(suggestion: Suggestion, order) -> list[dict]:
     ]
 
 
-def render_previews(problem: Problem, train, jac_sq_sum, cameras: Cameras) -> list[dict]:
-    """Colour, opacity and uncertainty of the chosen poses."""
+def render_uncertain(problem: Problem, train, jac_sq_sum, cameras: Cameras, label: str) -> list:
+    """Colour, opacity and uncertainty of every camera."""
     render = problem.render(train, jac_sq_sum, photo_rays(problem))
-    num_rays = int(num_pixels(cameras).sum())
-    with track(num_rays, f"render {len(cameras)} previews", "rays") as bar:
-        return render_views(
-            render, cameras, np.arange(len(cameras)), chunk=RENDER_CHUNK, progress_fn=bar.advance
-        )
-
-
-def photo_uncertainty(problem: Problem, train, jac_sq_sum, scale: float) -> np.ndarray:
-    """Uncertainty of all pixels of the photos at the reduced size."""
-    small = reduced_cameras(take(problem.scene.cameras, problem.scene.pool), scale)
-    render = problem.render(train, jac_sq_sum, photo_rays(problem))
-    num_rays = int(num_pixels(small).sum())
-    with track(num_rays, f"score the {len(small)} photos", "rays") as bar:
-        images = render_views(
-            lambda rays: {"uncertainty": render(rays)["uncertainty"]},
-            small,
-            np.arange(len(small)),
-            chunk=RENDER_CHUNK,
-            progress_fn=bar.advance,
-        )
-    return np.concatenate([image["uncertainty"].ravel() for image in images])
+    views = np.arange(len(cameras))
+    with track(int(num_pixels(cameras).sum()), label, "rays") as bar:
+        return render_views(render, cameras, views, chunk=RENDER_CHUNK, progress_fn=bar.advance)
 
 
 def write_results(
@@ -117,105 +217,102 @@ def write_results(
       The files by name.
     """
     scene = problem.scene
+    photos = np.asarray(scene.cameras.world_from_cam, np.float64)
 
     def density_fn(positions):
         return problem.density(train, positions)
 
     user_poses = user_transforms(scene, cameras.world_from_cam)
-    photo_places = around.to_user(np.asarray(scene.cameras.positions))
+    last_photo = around.to_user(photos[-1, :, 3])
     places = user_poses[suggestion.selected][:, :3, 3]
-    order, route_words = visiting_order(places, options, photo_places[-1])
+    order, route_words = visiting_order(places, options, last_photo)
     rows = make_rows(suggestion, order)
     chosen = suggestion.selected[order]
     picked_cameras, poses = take(cameras, chosen), user_poses[chosen]
-    as_photos = photo_cameras(scene, picked_cameras)
-
     files = {
         "poses": folder / "next_views" / "transforms.json",
         "camera path": folder / "next_views" / "camera_path.json",
         "table": folder / "next_views" / "next_views.csv",
         "report": folder / "report.html",
     }
-    exports.write_transforms(files["poses"], poses, as_photos, rows)
-    exports.write_camera_path(files["camera path"], poses, as_photos)
+    as_photos = photo_cameras(scene, picked_cameras)
+    write_transforms(files["poses"], poses, as_photos, rows)
+    write_camera_path(files["camera path"], poses, as_photos)
     # nerfstudio renders a camera path in the coordinates of its own normalisation, which are the
     # scene's: levelled, centred and scaled as by its defaults.
     normalised = files["camera path"].with_name("camera_path_normalised.json")
     scene_poses = np.tile(np.eye(4), (len(chosen), 1, 1))
     scene_poses[:, :3] = picked_cameras.world_from_cam
-    exports.write_camera_path(normalised, scene_poses, as_photos)
-    exports.write_csv(files["table"], poses, rows)
+    write_camera_path(normalised, scene_poses, as_photos)
+    write_csv(files["table"], poses, rows)
 
-    pixels = photo_uncertainty(problem, train, jac_sq_sum, options.score_scale)
-    images = render_previews(problem, train, jac_sq_sum, picked_cameras)
-    facts = pose_facts(
+    small = reduced_cameras(take(scene.cameras, scene.pool), options.score_scale)
+    label = f"score the {len(small)} photos"
+    seen = render_uncertain(problem, train, jac_sq_sum, small, label)
+    label = f"render {len(chosen)} previews"
+    images = render_uncertain(problem, train, jac_sq_sum, picked_cameras, label)
+    facts = page.pose_facts(
         scene,
         around,
         picked_cameras,
         images,
-        photo_uncertainty=pixels,
+        photo_uncertainty=np.concatenate([image["uncertainty"].ravel() for image in seen]),
         density_fn=density_fn,
     )
-    worth_words = words.worth_sentence(suggestion.worth, suggestion.photo_gain)
-    foggy = photos_in_matter(scene, density_fn, around)
-
-    cards_rows = [row | {"place": words.place_words(pose)} for row, pose in zip(rows, poses)]
-    cards, bar = page.preview_cards(images, cards_rows, [f.sentence() for f in facts])
-    start = options.start if options.start is not None else photo_places[-1]
+    worth_words = page.worth_sentence(suggestion.worth, suggestion.photo_gain)
+    cards, bar = preview_cards(images, rows, poses, facts)
+    start = last_photo if options.start is None else options.start
+    place = page.place_plot(
+        axes=page.levelled_axes(scene.up, photos[:, :, 3], around.focus),
+        unit=around.unit,
+        focus=around.focus,
+        photos=photos,
+        candidates=np.asarray(cameras.world_from_cam, np.float64),
+        scores=suggestion.scores,
+        selected=chosen,
+        route_start=around.to_scene(start) if options.route else None,
+    )
     width, height = (int(n) for n in picked_cameras.sizes[0])
-    portrait = height > width
-    page.write_page(
+    info = suggestion.info
+    write_template(
         files["report"],
-        title=scene.name,
-        headline=words.headline(scene, suggestion, proposals),
+        pathlib.Path(__file__).parent,
+        scene=scene,
+        options=options,
+        around=around,
+        proposals=proposals,
+        length=page.length,
+        portrait=height > width,
         worth=worth_words,
-        warnings=words.warnings(scene, around, facts, foggy),
+        num_foggy=photos_in_matter(scene, density_fn, around),
+        num_unseen=sum(fact.num_seeing == 0 for fact in facts),
+        num_left=int(info.survivors.sum()),
+        min_distance=float(info.filter.radii.min_train_distance) if info.filter else None,
+        half_length=np.log(2.0) / around.solid_density,
+        focus=around.to_user(around.focus),
+        photo_size=np.asarray(scene.cameras.sizes).max(axis=0),
         route=route_words,
         cards=cards,
         bar=bar,
-        card_columns="1fr 1fr 1.6fr" if portrait else "1fr 1fr",
-        words_place="" if portrait else "grid-column: 1 / -1;",
-        place=plots.place_plot(
-            axes=plots.levelled_axes(scene.up, np.asarray(scene.cameras.positions), around.focus),
-            unit=around.unit,
-            focus=around.focus,
-            photos=np.asarray(scene.cameras.world_from_cam, np.float64),
-            candidates=np.asarray(cameras.world_from_cam, np.float64),
-            scores=suggestion.scores,
-            selected=chosen,
-            order=options.route,
-            start=around.to_scene(start) if options.route else None,
-        ),
-        candidates=words.candidate_words(options, proposals, suggestion, around),
-        worth_curve=plots.worth_plot(suggestion.worth, suggestion.photo_gain),
-        numbers=words.numbers(rows, poses, facts),
+        place=Markup(place),
+        worth_curve=Markup(page.worth_plot(suggestion.worth, suggestion.photo_gain)),
+        numbers=page.numbers(rows, poses, facts),
         command=command,
-        details=words.details(problem, options, around, quality, foggy, seconds_fn()),
+        quality=quality,
+        seconds=seconds_fn(),
     )
-    made = {
+    worth = suggestion.worth
+    summary = {
         "scene": scene.name,
         "command": command,
         "device": device_name(),
         "seconds": seconds_fn(),
         "peak_memory_mb": peak_memory_mb(),
-    }
-    _write_summary(
-        folder / "suggestion.json", suggestion, proposals, rows, facts, worth_words, made
-    )
-    return files
-
-
-def _write_summary(
-    path, suggestion: Suggestion, proposals, rows, facts, worth_words, made: dict
-) -> None:
-    worth, first = suggestion.worth, suggestion.worth.best_left[0]
-    left = [None if np.isnan(x) else float(x) for x in worth.best_left]
-    value = made | {
         "drawn": proposals.num_drawn,
         "kept": len(proposals.poses),
         "dropped": proposals.dropped,
-        "best_gain": float(first),  # nats, as the next two
-        "best_left": left,
+        "best_gain": float(worth.best_left[0]),  # nats, as the next two
+        "best_left": [None if np.isnan(x) else float(x) for x in worth.best_left],
         "photo_gain": suggestion.photo_gain,
         "worth": worth_words,
         "views": [
@@ -223,4 +320,5 @@ def _write_summary(
             for row, fact in zip(rows, facts)
         ],
     }
-    write_json(path, value)
+    write_json(folder / "suggestion.json", summary)
+    return files

@@ -40,37 +40,28 @@ def parse_axes(texts: list[str], config, changes: Sequence[str] = ()) -> Axes:
       ConfigError: an axis that is unknown, given twice or empty, a value of another type, or more
         than `MAX_TRIALS` in all.
     """
-    found: dict[str, tuple] = {}
-    options = []
-    alone = []
-    seen: list[str] = []
+    own: dict[str, tuple] = {}
+    options, alone, seen = [], [], []
     for flag, text in [("axis", t) for t in texts] + [("change", t) for t in changes]:
-        name, equals, values = text.partition("=")
         try:
-            if len(text) > MAX_TEXT:
-                raise ConfigError(f"has {len(text):,} characters; give at most {MAX_TEXT:,}")
-            if not equals or not values:
-                raise ConfigError("give name=value,value, such as seed=0:5")
-            names = name.split("+")
+            names, rows = _parse(text, config)
             if len({*seen, *names}) < len(seen) + len(names):
-                raise ConfigError(f"{name} is given twice")
+                raise ConfigError(f"{'+'.join(names)} is given twice")
             seen += names
-            examples = [_example(n, config, alone=len(names) == 1) for n in names]
-            if name not in OWN_AXES.values():
-                (options if flag == "axis" else alone).append(
-                    _option_values(names, values, examples)
-                )
+            if names[0] not in OWN_AXES.values():
+                fields = [name.removeprefix("config.") for name in names]
+                values = tuple(dict(zip(fields, row)) for row in rows)
+                (options if flag == "axis" else alone).append(values)
             elif flag == "axis":
-                found[name] = _values(values, examples[0])
+                own[names[0]] = tuple(value for (value,) in rows)
             else:
-                raise ConfigError(f"{name} is an axis: --axis={text}")
+                raise ConfigError(f"{names[0]} is an axis: --axis={text}")
         except ConfigError as error:
-            raise ConfigError(
-                f"--{flag}={text if len(text) <= 200 else shown(text)}: {error}"
-            ) from None
+            given = text if len(text) <= 200 else shown(text)
+            raise ConfigError(f"--{flag}={given}: {error}") from None
     axes = Axes(
-        policies=found.get("policy", tuple(config.policies)),
-        seeds=found.get("seed", tuple(config.seeds)),
+        policies=own.get("policy", tuple(config.policies)),
+        seeds=own.get("seed", tuple(config.seeds)),
         options=tuple(options),
         changes=tuple(itertools.chain(*alone)),
     )
@@ -115,16 +106,22 @@ def _example(name: str, config, *, alone: bool):
     return known
 
 
-def _option_values(names: list[str], text: str, examples: list) -> tuple[dict[str, Any], ...]:
-    """What each value of an axis sets: one option, or several at once."""
-    options = [name.removeprefix("config.") for name in names]
+def _parse(text: str, config) -> tuple[list[str], list[tuple]]:
+    """Names of an axis, and rows with a value of each."""
+    if len(text) > MAX_TEXT:
+        raise ConfigError(f"has {len(text):,} characters; give at most {MAX_TEXT:,}")
+    name, _, values = text.partition("=")
+    if not values:
+        raise ConfigError("give name=value,value, such as seed=0:5")
+    names = name.split("+")
+    examples = [_example(n, config, alone=len(names) == 1) for n in names]
     if len(names) == 1:
-        return tuple({options[0]: value} for value in _values(text, examples[0]))
-    rows = [item.split("+") for item in _items(text)]
+        return names, [(value,) for value in _values(values, examples[0])]
+    rows = [item.split("+") for item in _items(values)]
     for row in rows:
         if len(row) != len(names):
             raise ConfigError(f"{'+'.join(row)!r} is not {len(names)} values")
-    return tuple({o: _value(v, e) for o, v, e in zip(options, row, examples)} for row in rows)
+    return names, [tuple(map(_value, row, examples)) for row in rows]
 
 
 def _values(text: str, example) -> tuple:

@@ -1,19 +1,25 @@
-"""From axes to jobs: a folder for each setting, a job for each of its parts."""
+"""What a sweep is made of: a folder for each setting, a job for each part, and `sweep.json`."""
 
 from __future__ import annotations
 
+import collections
 import copy
+import dataclasses
+import json
 import pathlib
 from functools import partial
 from typing import Any, NamedTuple
 
-from experiments.errors import ConfigError
-from experiments.parts import Part, all_parts, is_finished
+from experiments.errors import ConfigError, WorkdirError
+from experiments.files import read_versioned, write_json
 from experiments.sweeps.axes import Axes, setting_name, settings
-from experiments.sweeps.schedule import Job
+from experiments.sweeps.jobs import Job
+from experiments.workdir import Part, all_parts, is_finished
 
 UNCHANGED = "unchanged"  # folder of the config as it is, beside those of changes
 SCRIPT = ("-m", "experiments.active_selection")
+SCHEMA_VERSION = 1
+FILE = "sweep.json"
 
 
 class Setting(NamedTuple):
@@ -32,6 +38,12 @@ class Trial(NamedTuple):
     setting: Setting
     part: Part
     job: Job
+
+    @property
+    def num_steps(self) -> int:
+        """Optimiser steps from its beginning, round 0 not counted where it is shared."""
+        config = self.setting.config
+        return config.train.num_steps * (config.num_rounds if self.part.policy else 1)
 
 
 def make_settings(config, axes: Axes, workdir: pathlib.Path) -> list[Setting]:
@@ -91,7 +103,82 @@ def option_flag(name: str, value) -> str:
     return f"--config.{name}={value if isinstance(value, str) else repr(value)}"
 
 
-def num_steps(trial: Trial) -> int:
-    """Optimiser steps of a trial from its beginning, round 0 not counted where it is shared."""
-    config = trial.setting.config
-    return config.train.num_steps * (config.num_rounds if trial.part.policy else 1)
+class StepCounter:
+    """Optimiser steps that each part of a working folder has behind it."""
+
+    def __init__(self, workdir: pathlib.Path, steps_per_round: int):
+        self._path, self._steps_per_round = workdir / "metrics.jsonl", steps_per_round
+        self._offset = 0
+        self._steps = collections.Counter()
+
+    def read(self) -> dict[str, int]:
+        """Steps by name of the part, round 0 included; reads only what is new since last time."""
+        if not self._path.exists():
+            return self._steps
+        with open(self._path, "rb") as file:
+            file.seek(self._offset)
+            text = file.read()
+        end = text.rfind(b"\n") + 1
+        self._offset += end
+        for line in text[:end].splitlines():
+            try:
+                event = json.loads(line)
+            except ValueError:  # what was being written when a process was killed
+                continue
+            rounds = event["round"] + (event["event"] == "round")
+            steps = rounds * self._steps_per_round + event.get("step", 0)
+            part = f"{event['policy']}/seed_{event['seed']}"
+            # A part that was killed goes back to its checkpoint, which is no progress.
+            self._steps[part] = max(self._steps[part], steps)
+        return self._steps
+
+
+@dataclasses.dataclass
+class Record:
+    """`sweep.json`: what a sweep is made of, and what of it is missing and why."""
+
+    command: str
+    settings: list[dict[str, Any]]  # each: folder, values, policies, seeds
+    failed: dict[str, str]  # by folder/policy/seed_n: why, and where its log is
+
+    def missing(self, folder: str, results: set[tuple[str, int]]) -> dict[tuple[str, int], str]:
+        """Why a setting's runs that have no completed result have none, by policy and seed."""
+        setting = next(s for s in self.settings if s["folder"] == folder)
+        planned = [(p, s) for p in setting["policies"] for s in setting["seeds"]]
+        return {
+            (policy, seed): self.failed.get(f"{folder}/{policy}/seed_{seed}", "not run yet")
+            for policy, seed in planned
+            if (policy, seed) not in results
+        }
+
+
+def read_record(workdir: pathlib.Path) -> Record | None:
+    """The record of a sweep's folder; None where there is none.
+
+    Raises:
+      WorkdirError: the file is broken or of another version.
+    """
+    path = workdir / FILE
+    if not path.exists():
+        return None
+    fix = "delete it and run the sweep again"
+    content = read_versioned(path, SCHEMA_VERSION, error=WorkdirError, absent=fix, fix=fix)
+    return Record(content["command"], content["settings"], content["failed"])
+
+
+def write_record(workdir: pathlib.Path, record: Record) -> None:
+    """Writes the file."""
+    write_json(workdir / FILE, {"schema_version": SCHEMA_VERSION} | dataclasses.asdict(record))
+
+
+def merged(before: Record | None, now: Record) -> Record:
+    """A sweep taken up again: what it had before stays, with more settings, policies or seeds."""
+    if before is None:
+        return now
+    old = {setting["folder"]: setting for setting in before.settings}
+    rows = []
+    for setting in now.settings:
+        other = old.pop(setting["folder"], setting)
+        both = {key: [*setting[key], *other[key]] for key in ("policies", "seeds")}
+        rows.append(setting | {key: [*dict.fromkeys(values)] for key, values in both.items()})
+    return Record(now.command, rows + list(old.values()), now.failed | before.failed)

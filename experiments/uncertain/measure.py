@@ -25,11 +25,11 @@ from experiments.build import RENDER_CHUNK, Problem
 from experiments.evaluate import mean_quality, spread_evenly
 from experiments.files import read_arrays, read_json, write_arrays, write_json
 from experiments.keys import stream_key
-from experiments.machine import code_commit, device_name, versions
 from experiments.picture_stack import stack_pictures
 from experiments.progress import track
 from experiments.reporting.uncertainty import write_page
 from experiments.reporting.uncertainty_tables import NAME, SCHEMA_VERSION, save_result
+from experiments.runtime import code_commit, device_name, versions
 from experiments.trained import FIRST_ROUND, train_run
 from experiments.uncertain import intervals
 

@@ -4,8 +4,6 @@ To add a policy, write a file here with `POLICIES = (Policy(name=..., ...),)`. T
 sweep, the report and the battery of tests then know it.
 """
 
-from __future__ import annotations
-
 import difflib
 
 from bavs_jax.registry import collect

@@ -32,12 +32,7 @@ def great_circle(a, b, centre):
 
 
 def nearest_chosen(ctx, distance: Distance = euclidean):
-    """Distance of each candidate to the nearest training view or pick, [C].
-
-    Args:
-      ctx: the context.
-      distance: between cameras.
-    """
+    """Distance of each candidate to the nearest training view or pick, [C]."""
     chosen = jnp.concatenate([ctx.training_positions, ctx.positions])
     is_chosen = jnp.concatenate([ctx.is_training_view, ctx.picked])
     return masked_nearest(distance(ctx.positions, chosen, ctx.centre), is_chosen)

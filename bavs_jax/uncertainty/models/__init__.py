@@ -1,7 +1,5 @@
 """The table of uncertainty models: all that `UNCERTAINTY_MODELS` of the modules here hold."""
 
-from __future__ import annotations
-
 from bavs_jax.registry import collect
 from bavs_jax.uncertainty.model import UncertaintyModel
 

@@ -1,7 +1,5 @@
 """CF-NeRF (Shen et al. 2022): a distribution over fields, by conditional flows."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import partial
 

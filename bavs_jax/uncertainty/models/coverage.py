@@ -1,7 +1,5 @@
 """Coverage (CONVERGE): from how new a direction does a ray look at what it meets?"""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple
 

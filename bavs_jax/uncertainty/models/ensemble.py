@@ -1,7 +1,5 @@
 """Density-aware ensembles (Sünderhauf et al. 2022): fields from other starts that disagree."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

@@ -1,7 +1,5 @@
 """Ray entropy (Lee et al. 2022): where along the ray is the surface?"""
 
-from __future__ import annotations
-
 from bavs_jax.uncertainty.images import make_image_fn
 from bavs_jax.uncertainty.measures import ray_entropy
 from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
@@ -13,8 +11,7 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
         toolbox, toolbox.kind, lambda out: {"uncertainty": ray_entropy(out.weights)}
     )
     return ModelFns(
-        fit=lambda key, situation: None,
-        render=lambda fitted, train, rays: images(train, rays),
+        fit=lambda key, situation: None, render=lambda fitted, train, rays: images(train, rays)
     )
 
 

@@ -1,7 +1,5 @@
 """The paper's own: a Laplace approximation on the deformation grid (Eqs 6-13, Fig 4)."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """ActiveNeRF (Pan et al. 2022): a variance of colour that is trained with the field."""
 
-from __future__ import annotations
-
 import jax
 
 from bavs_jax.rendering.compositing import rendered_variance

@@ -1,0 +1,352 @@
+"""Jobs of a sweep: in what order they run, where, and what is done about those that die.
+
+Nothing here knows what a job does. An engine runs one job in one of its places and says how it
+ended; `run_jobs` hands it one after another.
+"""
+
+from __future__ import annotations
+
+import collections
+import os
+import pathlib
+import queue
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from typing import NamedTuple, Protocol
+
+from experiments.errors import ConfigError
+from experiments.signals import CODES
+
+STOPPED = {code: number for number, code in CODES.items()}  # exit codes of what was asked to end
+GPU_SHARE = 0.9  # of a GPU's memory that its jobs may take together
+PATIENCE = 5.0  # seconds from asking a process to end to making it
+
+
+class Job(NamedTuple):
+    """One process of the project's Python, to be run at most once to its end."""
+
+    name: str
+    argv: tuple[str, ...]  # after the name of the interpreter
+    log: pathlib.Path  # what it prints, all attempts one after another
+    is_finished: Callable[[], bool]  # from its files
+    needs: str | None = None  # another job that must be finished before
+
+
+class Engine(Protocol):
+    """Where jobs run."""
+
+    num_places: int  # jobs at a time
+
+    def run(self, job: Job) -> int | None:
+        """Runs a job to its end, in a thread of its own.
+
+        Returns:
+          its exit status; -n: killed by signal n; None: its machine is gone.
+        """
+
+    def stop(self) -> None:
+        """Ends all jobs that still run; none starts from then on."""
+
+
+class Event(NamedTuple):
+    """Something that happened to a job; `tick` is that time went by."""
+
+    kind: str  # "started", "retried", "finished", "failed" or "tick"
+    job: Job | None = None
+    reason: str = ""  # why it is tried again or has failed
+
+
+def run_jobs(
+    jobs: list[Job], engine: Engine, *, retries: int, wait_seconds: float = 1.0
+) -> Iterator[Event]:
+    """Runs jobs to their end and says what happens; closing the iterator stops what runs.
+
+    A job that is finished already is not started. One that dies without having said why (it is
+    killed, or its machine is gone) is started again, at most `retries` times; one that ends by
+    itself with an error would only do so again. A failure stops nothing but the jobs that need
+    the failed one.
+    """
+    waiting = {job.name: job for job in jobs}
+    running, failed, attempts = {}, set(), collections.Counter()
+    threads = ThreadPoolExecutor(engine.num_places)
+    try:
+        while waiting or running:
+            busy = {job.name for job in running.values()}
+            for job in list(waiting.values()):
+                if job.needs in waiting or job.needs in busy:
+                    continue
+                if job.is_finished():
+                    del waiting[job.name]
+                    yield Event("finished", job)
+                elif job.needs in failed:
+                    del waiting[job.name]
+                    failed.add(job.name)
+                    yield Event("failed", job, f"{job.needs}, which it needs, has failed")
+                elif len(running) < engine.num_places:
+                    del waiting[job.name]
+                    busy.add(job.name)
+                    attempts[job.name] += 1
+                    running[threads.submit(engine.run, job)] = job
+                    yield Event("started", job)
+            for future in wait(running, wait_seconds, FIRST_COMPLETED).done:
+                job, code = running.pop(future), future.result()
+                died = code is None or code < 0 or code in STOPPED
+                if code == 0 and job.is_finished():
+                    yield Event("finished", job)
+                elif died and attempts[job.name] <= retries:
+                    waiting = {job.name: job, **waiting}  # at the head: others may wait for it
+                    yield Event("retried", job, death_words(code))
+                else:
+                    failed.add(job.name)
+                    again = f", {attempts[job.name]} times" if attempts[job.name] > 1 else ""
+                    reason = f"{death_words(code)}{again}" if died else last_words(job.log)
+                    yield Event("failed", job, reason)
+            yield Event("tick")
+    finally:
+        engine.stop()
+        threads.shutdown()
+
+
+def death_words(code: int | None) -> str:
+    """How a process that did not end by itself came to its end."""
+    if code is None:
+        return "its machine or its worker is gone"
+    number = STOPPED.get(code, -code)
+    hint = "; out of memory?" if number == signal.SIGKILL else ""
+    return f"killed by {signal.Signals(number).name}{hint}"
+
+
+def last_words(log: pathlib.Path) -> str:
+    """The last line of a log."""
+    lines = log.read_text(encoding="utf-8", errors="replace").split("\n") if log.exists() else []
+    return next((line.strip() for line in reversed(lines) if line.strip()), "printed nothing")
+
+
+# --- processes of this machine ---------------------------------------------------------------
+
+
+class Slot(NamedTuple):
+    """Where one job runs."""
+
+    cores: tuple[int, ...]
+    env: dict[str, str]
+
+
+def make_slots(
+    cores: list[int],
+    memory_gb: float,
+    gpus: list[str],
+    *,
+    jobs: int = 0,
+    cores_per_trial: int = 1,
+    gb_per_trial: float = 2.0,
+) -> list[Slot]:
+    """As many slots as fit, each with cores of its own; at least one.
+
+    Jobs that share cores hinder each other: two with one core each get more done than two with
+    both, and than one with both. Where there are GPUs, there is a slot for each, or several share
+    one if more `jobs` are asked for.
+
+    Args:
+      cores: numbers of the cores that may be used.
+      memory_gb: of the host, in units of 10^9 bytes.
+      gpus: names of the GPUs.
+      jobs: most slots; 0: as many as fit.
+      cores_per_trial: least cores of a slot.
+      gb_per_trial: host memory that a job is expected to need.
+    """
+    fit = min(len(cores) // cores_per_trial, int(memory_gb / gb_per_trial))
+    num = max(1, min(fit, jobs or len(gpus) or fit))
+    width = max(cores_per_trial, len(cores) // num) if gpus else cores_per_trial
+    slots = []
+    for i in range(num):
+        own = tuple(cores[i * width : (i + 1) * width])
+        # Read by XLA, whose own count of cores ignores that others work beside it.
+        env = {"NPROC": str(len(own))}
+        if gpus:
+            sharing = -(-num // len(gpus))
+            env["CUDA_VISIBLE_DEVICES"] = gpus[i % len(gpus)]
+            env["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{GPU_SHARE / sharing:.3f}"
+        slots.append(Slot(own, env))
+    return slots
+
+
+def usable_cores() -> list[int]:
+    """The cores that this process may use, fewer where a container has less time than that."""
+    if hasattr(os, "sched_getaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+    else:
+        cores = list(range(os.cpu_count() or 1))
+    quota, _, period = _read("/sys/fs/cgroup/cpu.max").partition(" ")
+    return cores[: max(1, int(quota) // int(period))] if quota.isdigit() and period else cores
+
+
+def free_memory_gb() -> float:
+    """Memory of the host that new processes can have, in units of 10^9 bytes."""
+    free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    for line in _read("/proc/meminfo").splitlines():
+        if line.startswith("MemAvailable:"):
+            free = int(line.split()[1]) * 1024
+    limits = [_read(f"/sys/fs/cgroup/{n}") for n in ("memory.max", "memory/memory.limit_in_bytes")]
+    return min([free, *(int(limit) for limit in limits if limit.isdigit())]) / 1e9
+
+
+def visible_gpus() -> list[str]:
+    """Names of NVIDIA's GPUs as CUDA_VISIBLE_DEVICES takes them.
+
+    JAX is not asked: it would take their memory for this process.
+    """
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if given is not None:
+        return [name for name in given.split(",") if name]
+    if os.environ.get("JAX_PLATFORMS", "").startswith("cpu") or not shutil.which("nvidia-smi"):
+        return []
+    query = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
+    listed = subprocess.run(query, capture_output=True, text=True)
+    return listed.stdout.split() if listed.returncode == 0 else []
+
+
+def _read(path: str) -> str:
+    """A small file's text, empty where there is no such file: not every system has each."""
+    try:
+        return pathlib.Path(path).read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
+
+
+def open_process(argv, log: pathlib.Path, *, env=None, cwd=None) -> subprocess.Popen:
+    """Starts this Python with `argv`; all it prints is added to the log.
+
+    It has a session of its own, so that ctrl-C reaches only the program that started it, and its
+    standard input is a pipe, which closes when that program is killed.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with open(log, "ab", buffering=0) as file:
+        file.write(f"$ python {shlex.join(argv)}\n".encode())
+        return subprocess.Popen(
+            [sys.executable, *argv],
+            stdin=subprocess.PIPE,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=os.environ | (env or {}),
+            cwd=cwd,
+            start_new_session=True,
+        )
+
+
+def end_process(process: subprocess.Popen) -> None:
+    """Asks a process to end, and makes it."""
+    process.terminate()
+    try:
+        process.wait(PATIENCE)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+class LocalEngine:
+    """Each job is a process of this machine, on cores of its own."""
+
+    def __init__(self, slots: list[Slot]):
+        self.num_places = len(slots)
+        self._free: queue.SimpleQueue[Slot] = queue.SimpleQueue()
+        for slot in slots:
+            self._free.put(slot)
+        self._lock, self._processes, self._stopped = threading.Lock(), set(), False
+
+    def run(self, job: Job) -> int | None:
+        slot = self._free.get()
+        try:
+            with self._lock:
+                if self._stopped:
+                    return None
+                if hasattr(os, "sched_setaffinity"):
+                    os.sched_setaffinity(0, slot.cores)  # of this thread, and what it starts
+                process = open_process(job.argv, job.log, env=slot.env)
+                self._processes.add(process)
+            return process.wait()
+        finally:
+            self._free.put(slot)
+
+    def stop(self) -> None:
+        with self._lock:
+            self._stopped = True
+        left = [process for process in self._processes if process.poll() is None]
+        for process in left:
+            process.terminate()
+        for process in left:
+            end_process(process)
+
+
+# --- a Ray cluster ---------------------------------------------------------------------------
+
+
+class RayEngine:
+    """Each job runs on a machine of a Ray cluster, with a GPU of its own where there are some.
+
+    All machines must have the project installed and see the working folder under the same path.
+    Ray is handed all jobs that can start and finds room for them; it retries none of them, so that
+    an attempt is counted in one place. A job is a process of its own here too: it ends with its
+    worker, and so with its machine.
+    """
+
+    num_places = 1000
+
+    def __init__(self, address: str | None = None, cores_per_trial: int = 1):
+        try:
+            import ray
+        except ImportError:
+            raise ConfigError("--engine=ray: ray is missing; pip install -e '.[ray]'") from None
+        self._ray = ray
+        try:
+            ray.init(address=address or None, log_to_driver=False, logging_level="error")
+        except ConnectionError as error:
+            raise ConfigError(f"--ray_address: {' '.join(str(error).split())}") from None
+        gpus = 1 if ray.cluster_resources().get("GPU") else 0
+        self._task = ray.remote(
+            num_cpus=cores_per_trial, num_gpus=gpus, max_retries=0, max_calls=1
+        )(_run_process)
+        self._env = {"NPROC": str(cores_per_trial)}
+        self._lock, self._running, self._stopped = threading.Lock(), set(), False
+
+    def run(self, job: Job) -> int | None:
+        with self._lock:
+            if self._stopped:
+                return None
+            ref = self._task.remote(job.argv, str(job.log.absolute()), self._env, os.getcwd())
+            self._running.add(ref)
+        try:
+            return self._ray.get(ref)
+        except self._ray.exceptions.RayTaskError as error:
+            # The worker lives, but could not even start the process.
+            with open(job.log, "a", encoding="utf-8") as file:
+                file.write(f"{error}\n")
+            return 1
+        except self._ray.exceptions.RayError:
+            return None
+        finally:
+            self._running.discard(ref)
+
+    def stop(self) -> None:
+        with self._lock:
+            self._stopped = True
+        if left := list(self._running):
+            for ref in left:
+                self._ray.cancel(ref, force=True)
+            self._ray.wait(left, num_returns=len(left), timeout=PATIENCE)
+        self._ray.shutdown()
+
+
+def _run_process(argv, log: str, env: dict[str, str], cwd: str) -> int:
+    """A process from start to end, in a worker of Ray; see `open_process`."""
+    process = open_process(argv, pathlib.Path(log), env=env, cwd=cwd)
+    try:
+        return process.wait()
+    finally:
+        end_process(process)
