@@ -4,6 +4,8 @@ Poses use the OpenGL axes (x right, y up, the camera looks along -z) and pixel c
 integer + 0.5, so that the ray through the middle of a W x H image is pixel (W / 2, H / 2).
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -76,6 +78,19 @@ def image_pixels(width: int, height: int) -> np.ndarray:
     """Pixel centres of a whole image in row order, [H * W, 2] float32 (x, y)."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([x, y], axis=-1).reshape(-1, 2).astype(np.float32)
+
+
+def subpixel_offsets(rays_per_pixel: int) -> np.ndarray:
+    """Where the rays of a pixel go: an even grid, relative to its centre, [rays_per_pixel, 2].
+
+    Raises:
+      ValueError: the number is no square.
+    """
+    side = math.isqrt(rays_per_pixel)
+    if side**2 != rays_per_pixel or side < 1:
+        raise ValueError(f"rays_per_pixel: {rays_per_pixel} is no square; give 1, 4 or 9")
+    steps = (np.arange(side) + 0.5) / side - 0.5
+    return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2).astype(np.float32)
 
 
 def view_pixels(cameras: Cameras, view_ids) -> tuple[np.ndarray, np.ndarray]:

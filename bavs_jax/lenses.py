@@ -164,17 +164,12 @@ def undistort(xy_distorted: Array, distortion: Array, *, lens: str) -> Array:
 
 
 def lens_directions(xy: Array, *, lens: str) -> jax.Array:
-    """Directions that the points of a lens's undistorted plane stand for, OpenGL axes.
+    """Directions [..., 3], of any length, for points [..., 2] of a lens's undistorted plane.
 
     `[x, -y, -1]`, or `[sin(theta) x / theta, -sin(theta) y / theta, -cos(theta)]` with
-    `theta = |xy|` for a fisheye, so that fields of view up to 360 degrees are right.
+    `theta = |xy|` for a fisheye, so that fields of view up to 360 degrees are right; OpenGL axes.
 
-    Args:
-      xy: [..., 2].
-      lens: a key of `LENSES`.
-
-    Returns:
-      [..., 3] vectors in camera coordinates, of any length.
+    `lens` is a key of `LENSES`.
     """
     x, y = xy[..., 0], xy[..., 1]
     if lens == "fisheye":

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from bavs_jax.cameras import Cameras, Rays, pixel_rays
+from bavs_jax.arrays import Array
+from bavs_jax.cameras import Cameras, Rays, pixel_rays, subpixel_offsets
 from bavs_jax.scenes.base import Scene
 
 
@@ -56,13 +57,24 @@ def training_sizes(table: PixelTable, is_training_view: jax.Array) -> jax.Array:
 
 
 class PixelBatch(struct.PyTreeNode):
-    """R training pixels."""
+    """P training pixels, each the mean of what its own rays see: R in all, side by side."""
 
-    rays: Rays
-    rgb: jax.Array  # [R, 3] true colours in [0, 1]
-    ray_weight: jax.Array  # [R], 0 for masked pixels
+    rays: Rays  # [R]
+    rgb: jax.Array  # [P, 3] true colours in [0, 1]
+    pixel_weight: jax.Array  # [P], 0 for masked pixels
     view_ids: jax.Array  # [R] int32
     background: jax.Array | None  # [R, 3] colour behind everything; see `composite_colour`
+
+    def mean(self, values: jax.Array) -> jax.Array:
+        """What pixels show: means over their rays, [R, ...] -> [P, ...]."""
+        return self._by_pixel(values).mean(1)
+
+    def whole(self, ray_mask: jax.Array) -> jax.Array:
+        """Pixels all of whose rays are marked, [R] bool -> [P] bool."""
+        return self._by_pixel(ray_mask).all(1)
+
+    def _by_pixel(self, values: jax.Array) -> jax.Array:
+        return values.reshape(len(self.rgb), -1, *values.shape[1:])
 
 
 def sample_pixels(
@@ -71,29 +83,33 @@ def sample_pixels(
     is_training_view: jax.Array,
     num_rays: int,
     *,
+    rays_per_pixel: int = 1,
     background=None,
     random_background: bool = False,
 ) -> PixelBatch:
     """Uniform over all pixels of the training views, with replacement.
 
-    With `random_background`, each ray gets a background of its own, uniform in colour, wherever
+    A photo's pixel is a mean over its area, not what one ray sees: several rays through it, on an
+    even grid, are averaged before they are compared with it.
+
+    With `random_background`, each pixel gets a background of its own, uniform in colour, wherever
     photos have alpha: `rgb + (1 - alpha) (b' - b)`. Fog of the background's colour then costs as
     much as any other, where over one fixed colour it explains an empty pixel for nothing.
 
     Args:
       is_training_view: bool [V], at least one true.
-      num_rays: R.
+      num_rays: R, a multiple of `rays_per_pixel`.
+      rays_per_pixel: 1, 4 or 9; see `subpixel_offsets`.
       background: b [3], which the photos are shown over; None: see `composite_colour`.
       random_background: see above; does nothing where photos are opaque.
     """
     sizes = training_sizes(table, is_training_view)
     ends = jnp.cumsum(sizes)
-    number = jax.random.randint(key, (num_rays,), 0, ends[-1])
+    number = jax.random.randint(key, (num_rays // rays_per_pixel,), 0, ends[-1])
     view_ids = jnp.searchsorted(ends, number, side="right")
     pixel_ids = number - (ends - sizes)[view_ids]
-    rays = view_pixel_rays(table.cameras, view_ids, pixel_ids)
     if table.pixel_mask.shape[0] == 1:
-        weight = jnp.ones(num_rays)
+        weight = jnp.ones(len(number))
     else:
         weight = table.pixel_mask[table.offsets[view_ids] + pixel_ids].astype(jnp.float32)
     rgb = pixel_colours(table, view_ids, pixel_ids)
@@ -104,7 +120,15 @@ def sample_pixels(
         drawn = jax.random.uniform(jax.random.fold_in(key, 1), rgb.shape)
         rgb = rgb + seen_through[:, None] * (drawn - background)
         background = drawn
-    return PixelBatch(rays, rgb, weight, view_ids, background)
+
+    def of_rays(values):
+        return jnp.repeat(values, rays_per_pixel, axis=0)
+
+    offsets = jnp.tile(subpixel_offsets(rays_per_pixel), (len(number), 1))
+    rays = view_pixel_rays(table.cameras, of_rays(view_ids), of_rays(pixel_ids), offsets)
+    if background is not None:
+        background = of_rays(background)
+    return PixelBatch(rays, rgb, weight, of_rays(view_ids), background)
 
 
 def pixel_colours(table: PixelTable, view_ids: jax.Array, pixel_ids: jax.Array) -> jax.Array:
@@ -112,10 +136,15 @@ def pixel_colours(table: PixelTable, view_ids: jax.Array, pixel_ids: jax.Array) 
     return table.pixels[table.offsets[view_ids] + pixel_ids].astype(jnp.float32) / 255.0
 
 
-def view_pixel_rays(cameras: Cameras, view_ids: jax.Array, pixel_ids: jax.Array) -> Rays:
-    """Rays through pixels, numbered in row order, of the views `view_ids`; both [R]."""
+def view_pixel_rays(
+    cameras: Cameras, view_ids: jax.Array, pixel_ids: jax.Array, offsets: Array | float = 0.0
+) -> Rays:
+    """Rays through pixels, numbered in row order, of the views `view_ids`; both [R].
+
+    They go through the pixels' centres, or `offsets` [R, 2] beside these, in pixels.
+    """
     width = cameras.sizes[view_ids, 0]
-    pixels = jnp.stack([pixel_ids % width, pixel_ids // width], axis=-1) + 0.5
+    pixels = jnp.stack([pixel_ids % width, pixel_ids // width], axis=-1) + 0.5 + offsets
     return pixel_rays(cameras, view_ids, pixels)
 
 

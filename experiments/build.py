@@ -238,10 +238,16 @@ def build_problem(
 
 def check_shards(config, mesh: Mesh | None) -> None:
     """Raises ConfigError if rays cannot be spread evenly over the devices of a mesh."""
-    for name, num in (("config.train.num_rays", config.train.num_rays), ("images", RENDER_CHUNK)):
+    num_pixels, rest = divmod(config.train.num_rays, config.rays_per_pixel)
+    if rest:
+        raise ConfigError(
+            f"config.train.num_rays: {config.train.num_rays} is no multiple of "
+            f"config.rays_per_pixel, {config.rays_per_pixel}"
+        )
+    for name, num in (("config.train.num_rays", num_pixels), ("images", RENDER_CHUNK)):
         if num % num_shards(mesh):
             raise ConfigError(
-                f"{name}: {num} rays at once cannot be spread over {num_shards(mesh)} devices: "
+                f"{name}: {num} pixels at once cannot be spread over {num_shards(mesh)} devices: "
                 "take a number of --devices that divides them"
             )
 

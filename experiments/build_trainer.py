@@ -62,6 +62,7 @@ def build_model(
     training = RayTraining(
         objective,
         num_rays=train.num_rays,
+        rays_per_pixel=config.rays_per_pixel,
         random_background=train.random_background,
         penalty_weight=train.penalty_weight,
         roughness_weight=train.roughness_weight,

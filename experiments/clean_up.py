@@ -138,13 +138,19 @@ def sweep_views(cleaned: Callable, run: TrainedRun, view_ids, thresholds, label:
     """
     table, sums = run.state.table, []
     offsets = np.asarray(table.offsets)
-    total = int(np.diff(offsets)[view_ids].sum())
+    rays_per_pixel = run.config.rays_per_pixel
+    total = rays_per_pixel * int(np.diff(offsets)[view_ids].sum())
     chunk_fn = cleaned(thresholds)
     with track(total, f"{run.label}: {label}", "rays") as bar:
         # One view at a time: its images at every threshold are T times as large as the view.
         for view in view_ids:
             (images,) = render_views(
-                chunk_fn, table.cameras, [view], chunk=RENDER_CHUNK, progress_fn=bar.advance
+                chunk_fn,
+                table.cameras,
+                [view],
+                chunk=RENDER_CHUNK,
+                rays_per_pixel=rays_per_pixel,
+                progress_fn=bar.advance,
             )
             mask = run.pixel_mask(view)
             counted = {name: value[mask] for name, value in images.items()}
@@ -212,7 +218,13 @@ def sweep_figure(train: Sweep, test: Sweep, row: int) -> Figure:
 def views_figure(run: TrainedRun, cleaned: Callable, view_ids, threshold) -> Figure:
     """Test views before and after, and the opacity that went."""
     cameras, names = run.state.table.cameras, run.problem.scene.names
-    images = render_views(cleaned([threshold, np.inf]), cameras, view_ids, chunk=RENDER_CHUNK)
+    images = render_views(
+        cleaned([threshold, np.inf]),
+        cameras,
+        view_ids,
+        chunk=RENDER_CHUNK,
+        rays_per_pixel=run.config.rays_per_pixel,
+    )
     rows = []
     for view, image in zip(view_ids, images):
         truth = run.truth(view)

@@ -68,13 +68,16 @@ def spread_evenly(view_ids, num: int) -> np.ndarray:
     return view_ids[np.arange(num) * len(view_ids) // num]
 
 
-def evaluate_views(render_fn, scene, view_ids, *, lpips_fn=None, progress_fn=None) -> dict:
+def evaluate_views(
+    render_fn, scene, view_ids, *, rays_per_pixel: int = 1, lpips_fn=None, progress_fn=None
+) -> dict:
     """Mean image measures over views by the 8-bit protocol, and the mean depth error.
 
     Args:
-      render_fn: `Rays` [chunk] -> dict with "rgb" and "depth".
+      render_fn: `Rays` [chunk] -> dict with "rgb", "depth" and "opacity".
       scene: the scene with the true images.
       view_ids: [n] which views.
+      rays_per_pixel: see `render_views`; as many as the field was trained with.
       lpips_fn: see `measure_images`.
       progress_fn: called with the number of rays done.
 
@@ -85,13 +88,14 @@ def evaluate_views(render_fn, scene, view_ids, *, lpips_fn=None, progress_fn=Non
 
     def measured_part(rays):
         rendering = render_fn(rays)
-        return {name: rendering[name] for name in ("rgb", "depth", "thinned")}
+        return {name: rendering[name] for name in ("rgb", "depth", "opacity", "thinned")}
 
     images = render_views(
         measured_part,
         scene.cameras,
         view_ids,
         chunk=RENDER_CHUNK,
+        rays_per_pixel=rays_per_pixel,
         progress_fn=progress_fn,
     )
     means = mean_quality(scene, view_ids, images, lpips_fn=lpips_fn)
@@ -110,12 +114,14 @@ def measure_test_views(problem, train, num: int, label: str) -> dict:
     """
     scene = problem.scene
     view_ids = spread_evenly(scene.test, num)
-    num_pixels = int(sum(np.diff(scene.offsets)[view_ids]))
-    with track(num_pixels, f"{label}: {len(view_ids)} test views", "rays") as bar:
+    rays_per_pixel = problem.config.rays_per_pixel
+    num_rays = rays_per_pixel * int(sum(np.diff(scene.offsets)[view_ids]))
+    with track(num_rays, f"{label}: {len(view_ids)} test views", "rays") as bar:
         return evaluate_views(
             problem.render(train),
             scene,
             view_ids,
+            rays_per_pixel=rays_per_pixel,
             lpips_fn=problem.lpips_fn,
             progress_fn=bar.advance,
         )
@@ -150,12 +156,14 @@ def _mean(values) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def picture_arrays(render_fn, scene, view_ids) -> dict[str, np.ndarray]:
+def picture_arrays(render_fn, scene, view_ids, *, rays_per_pixel: int = 1) -> dict[str, np.ndarray]:
     """Truth, render, error, uncertainty and depth of some views, for the report.
 
     Views may differ in size: see `stack_pictures`, and `sizes` [n, 2] (width, height).
     """
-    images = render_views(render_fn, scene.cameras, view_ids, chunk=RENDER_CHUNK)
+    images = render_views(
+        render_fn, scene.cameras, view_ids, chunk=RENDER_CHUNK, rays_per_pixel=rays_per_pixel
+    )
     truth = stack_pictures([scene.image(v) for v in view_ids])
     rgb = stack_pictures([np.clip(image["rgb"], 0.0, 1.0) for image in images])
     return {

@@ -239,7 +239,12 @@ class Run:
         path, pictures_path = self.folder / "result.json", self.folder / "pictures.npz"
         if completed and (self.seed == config.seeds[0] or pictures_path.exists()):
             view_ids = spread_evenly(scene.test, config.num_pictures)
-            pictures = picture_arrays(self._uncertain_render_fn(state), scene, view_ids)
+            pictures = picture_arrays(
+                self._uncertain_render_fn(state),
+                scene,
+                view_ids,
+                rays_per_pixel=config.rays_per_pixel,
+            )
             write_arrays(pictures_path, **pictures, round=int(state.round))
         if not is_first_process():
             return

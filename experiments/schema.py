@@ -103,6 +103,7 @@ TEXT = Option(
     "up to 1,000 characters that can be printed",
     lambda value: type(value) is str and len(value) <= 1000 and value.isprintable(),
 )
+RAYS_PER_PIXEL = Option("1, 4 or 9", lambda value: type(value) is int and value in (1, 4, 9))
 SEED = whole(0, MAX_SEED)
 SEED_TEXT = Option(
     f"a whole number from 0 to {MAX_SEED:,} as text, or '': each seed its own",
@@ -146,6 +147,7 @@ SCHEMA = {
     "checkpoint_seconds": number(0.0, MAX_VALUE),
     "field_kind": choice(*SAMPLERS),
     "sampler_kind": choice("", *sorted({*itertools.chain(*SAMPLERS.values())})),
+    "rays_per_pixel": RAYS_PER_PIXEL,
     "field.num_levels": LEVELS,
     "field.coarsest": RESOLUTION,
     "field.finest": RESOLUTION,

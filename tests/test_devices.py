@@ -116,7 +116,7 @@ def test_rays_that_cannot_be_spread_are_named():
     class ThreeDevices:
         size = 3
 
-    with pytest.raises(ConfigError, match=r"config\.train\.num_rays: 128 rays .* 3 devices"):
+    with pytest.raises(ConfigError, match=r"config\.train\.num_rays: 128 pixels .* 3 devices"):
         check_shards(toy_config(), ThreeDevices)
 
 

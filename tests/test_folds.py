@@ -114,8 +114,8 @@ def test_a_capture_says_how_many_and_leaves_them_out(tmp_path):
     # Training: they are drawn with a weight of 0.
     table = make_pixel_table(scene)
     batch = sample_pixels(jax.random.key(0), table, np.ones(8, bool), 2000)
-    share = 1.0 - np.mean(batch.ray_weight)
-    assert set(np.unique(batch.ray_weight)) == {0.0, 1.0}
+    share = 1.0 - np.mean(batch.pixel_weight)
+    assert set(np.unique(batch.pixel_weight)) == {0.0, 1.0}
     hidden = 1.0 - expected.mean()  # 5 standard errors
     assert abs(share - hidden) < 5.0 * np.sqrt(hidden * (1.0 - hidden) / 2000)
 

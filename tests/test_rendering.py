@@ -7,13 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bavs_jax.cameras import Rays
+from bavs_jax.cameras import Rays, pixel_rays, subpixel_offsets, view_pixels
 from bavs_jax.rendering.compositing import (
     composite,
     expected_depth,
     render_weights,
     transmittance,
 )
+from bavs_jax.rendering.images import render_pixels, render_views
 from bavs_jax.rendering.occupancy import (
     WARMUP_UPDATES,
     cell_index,
@@ -31,6 +32,7 @@ from bavs_jax.rendering.sampling import (
 )
 from tests.oracles_rendering import march_loop, render_loop, weights_loop
 from tests.toy_fields import rays_through, smooth_field_fn
+from tests.toy_scenes import toy_scene
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -437,3 +439,41 @@ def test_channels_are_composited_over_their_floor():
     want = 2.0 * got.opacity - 3.0 * (1.0 - got.opacity)
     np.testing.assert_allclose(got.channels["two"], want, atol=1e-5)
     assert got.channels["two"][-1] == -3.0 and got.opacity[-1] == 0.0
+
+
+# --- pixels of several rays --------------------------------------------------------------------
+
+
+def test_a_pixel_shows_the_mean_of_its_rays_and_depth_counts_by_opacity():
+    scene = toy_scene()
+    ids, pixels = view_pixels(scene.cameras, [2, 5])
+
+    def look(rays):
+        x, y, z = (np.asarray(rays.directions)[:, i] for i in range(3))
+        opacity = np.where(x > 0.1, np.abs(y), 0.0)  # some rays of a pixel see nothing
+        return {"rgb": np.abs(np.asarray(rays.directions)), "depth": 2.0 + z, "opacity": opacity}
+
+    got = render_pixels(look, scene.cameras, ids, pixels, chunk=50, rays_per_pixel=4)
+    each = [
+        look(pixel_rays(scene.cameras, jnp.asarray(ids), pixels + np.array(offset, np.float32)))
+        for offset in ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
+    ]
+    opacity = np.mean([rows["opacity"] for rows in each], axis=0)
+    seen = sum(rows["opacity"] * rows["depth"] for rows in each) / 4.0
+    np.testing.assert_allclose(got["rgb"], np.mean([r["rgb"] for r in each], axis=0), atol=1e-6)
+    np.testing.assert_allclose(got["opacity"], opacity, atol=1e-6)
+    expected = np.where(opacity > 0, seen / np.where(opacity > 0, opacity, 1.0), 0.0)
+    assert 0 < (opacity == 0).sum() < len(ids)
+    np.testing.assert_allclose(got["depth"], expected, atol=1e-5)
+    images = render_views(look, scene.cameras, [2, 5], chunk=50, rays_per_pixel=4)
+    np.testing.assert_array_equal(images[1]["rgb"].reshape(-1, 3), got["rgb"][64:])
+
+
+def test_rays_of_a_pixel_are_an_even_grid_around_its_centre():
+    np.testing.assert_array_equal(subpixel_offsets(1), [[0.0, 0.0]])
+    nine = subpixel_offsets(9)
+    np.testing.assert_allclose(nine.mean(0), 0.0, atol=1e-7)
+    assert len(np.unique(np.round(nine, 4), axis=0)) == 9 and np.abs(nine).max() < 0.5
+    for wrong in (0, 2, 8):
+        with pytest.raises(ValueError, match="is no square; give 1, 4 or 9"):
+            subpixel_offsets(wrong)

@@ -8,6 +8,7 @@ import numpy as np
 import optax
 import pytest
 
+from bavs_jax.cameras import project
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.fields.hash_grid import make_hash_grid_field, table_roughness
 from bavs_jax.models.base import ModelState
@@ -21,6 +22,7 @@ from bavs_jax.pixel_table import (
     training_pixels,
     view_pixel_rays,
 )
+from bavs_jax.rendering.render import render_rays
 from bavs_jax.rendering.samplers import make_occupancy_sampler
 from bavs_jax.rendering.sampling import make_march_options
 from bavs_jax.training.checkpoints import Checkpoints
@@ -163,7 +165,7 @@ def test_sampled_pixels_come_from_training_views_alone_and_from_all_of_them(trai
     positions = np.asarray(scene.cameras.positions)
     owner = np.linalg.norm(rays.origins[:, None] - positions, axis=-1).argmin(1)
     counts = np.bincount(owner, minlength=scene.num_views)
-    assert set(np.flatnonzero(counts)) == {1, 4, 7} and (batch.ray_weight == 1).all()
+    assert set(np.flatnonzero(counts)) == {1, 4, 7} and (batch.pixel_weight == 1).all()
     np.testing.assert_array_equal(owner, batch.view_ids)
     # Binomial with p = 1/3: standard deviation 26; four of them.
     np.testing.assert_allclose(counts[[1, 4, 7]], 1000, atol=104)
@@ -185,7 +187,7 @@ def test_a_sampled_pixel_has_its_own_ray_colour_and_weight():
     view_of = np.searchsorted(scene.offsets, np.arange(num), side="right") - 1
     np.testing.assert_array_equal(np.unique(rows), np.flatnonzero(is_training[view_of]))
     np.testing.assert_array_equal(batch.view_ids, view_of[rows])
-    np.testing.assert_array_equal(batch.ray_weight, keep[rows])
+    np.testing.assert_array_equal(batch.pixel_weight, keep[rows])
     rays = view_pixel_rays(table.cameras, view_of[rows], rows - scene.offsets[view_of[rows]])
     np.testing.assert_allclose(batch.rays.origins, rays.origins, atol=1e-6)
     np.testing.assert_allclose(batch.rays.directions, rays.directions, atol=1e-6)
@@ -206,12 +208,66 @@ def test_rays_and_colours_belong_together(trainer):
     assert (is_ball.reshape(8, 8) == (colours < 1).any(-1)).all()
 
 
+def test_the_rays_of_a_pixel_are_side_by_side_on_an_even_grid_within_it():
+    scene = toy_scene()
+    table, mask = make_pixel_table(scene), jnp.ones(scene.num_views, bool)
+    options = {"background": scene.background}
+    batch = sample_pixels(jax.random.key(0), table, mask, 400, rays_per_pixel=4, **options)
+    alone = sample_pixels(jax.random.key(0), table, mask, 100, **options)  # the same pixels
+    np.testing.assert_array_equal(batch.rgb, alone.rgb)
+    np.testing.assert_array_equal(
+        batch.view_ids.reshape(100, 4), np.repeat(alone.view_ids, 4).reshape(100, 4)
+    )
+    cameras = jax.tree.map(lambda x: x[batch.view_ids], table.cameras)
+    places = np.asarray(
+        jax.vmap(lambda c, o, d: project(c, o + d)[0])(
+            cameras, batch.rays.origins, batch.rays.directions
+        )
+    ).reshape(100, 4, 2)
+    within = places - np.floor(places[:, :1])
+    corners = [[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]]
+    np.testing.assert_allclose(within, np.tile(corners, (100, 1, 1)), atol=1e-3)
+    np.testing.assert_allclose(batch.background, np.ones((400, 3)) * scene.background)
+
+
+def test_the_loss_compares_the_mean_of_a_pixel_s_rays_and_leaves_out_pixels_that_were_cut(trainer):
+    """By hand: every ray rendered alone, their mean, and the pixels all of whose rays fitted."""
+    scene, model, *_ = trainer
+    field, sampler = model.field, model.sampler
+    table, mask = make_pixel_table(scene), jnp.ones(scene.num_views, bool)
+    batch = sample_pixels(
+        jax.random.key(1), table, mask, 64, rays_per_pixel=4, background=scene.background
+    )
+    params, state = field.init(jax.random.key(2)), sampler.init_state()
+    samples, _ = sampler.sample(None, {}, state, batch.rays)
+    counts = np.asarray(samples.sample_mask.sum(-1)).reshape(-1, 4)
+    cut = next(p for p in range(4, 16) if counts[p, 1] and counts[p, 2])
+    capacity = int(counts[:cut].sum() + counts[cut, :2].sum())  # half of that pixel's rays fit
+    outcome = make_colour_objective(field, capacity=capacity)(None, params, batch, samples)
+    render = jax.jit(
+        partial(
+            render_rays,
+            field_fn=partial(field.apply, params),
+            background=scene.background,
+            capacity=64,
+            exact=True,
+        )
+    )
+    rays = [jax.tree.map(lambda x, i=i: x[i : i + 1], (batch.rays, samples)) for i in range(64)]
+    alone = np.stack([np.asarray(render(*one).rgb[0]) for one in rays[: 4 * cut]])
+    colours = alone.reshape(cut, 4, 3).mean(1)
+    expected = np.square(colours - np.asarray(batch.rgb)[:cut]).mean()
+    assert not outcome.ray_mask[4 * cut + 2] and outcome.ray_mask[4 * cut + 1]
+    np.testing.assert_allclose(outcome.loss, expected, rtol=1e-5)
+    np.testing.assert_allclose(outcome.rgb[:cut], colours, atol=1e-6)
+
+
 def test_masked_pixels_have_no_weight():
     scene = toy_scene(num_views=4, num_test=1)
     keep = np.arange(len(scene.pixels)) % 2 == 0
     table = make_pixel_table(scene).replace(pixel_mask=jnp.asarray(keep))
     batch = sample_pixels(jax.random.key(0), table, jnp.ones(4, bool), 400)
-    assert 120 < int(batch.ray_weight.sum()) < 280  # half of 400, many standard deviations wide
+    assert 120 < int(batch.pixel_weight.sum()) < 280  # half of 400, many standard deviations wide
     view_ids, pixel_ids = training_pixels(table, np.ones(4, bool))
     assert len(view_ids) == keep.sum()
     assert (keep[scene.offsets[view_ids] + pixel_ids]).all()

@@ -17,6 +17,7 @@ OVERRIDES = {
     "num_initial": 2,
     "lpips_net": "",
     "checkpoint_seconds": 0.0,
+    "rays_per_pixel": 1,
     "field.num_levels": 2,
     "field.finest": 32,
     "field.width": 16,

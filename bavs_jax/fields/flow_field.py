@@ -61,7 +61,7 @@ def mean_field(flow: FlowField) -> Field:
 
 
 def positive_density(raw: jax.Array, scale) -> tuple[jax.Array, jax.Array]:
-    """Density `scale * softplus(raw - 4)` and the logarithm of its derivative.
+    """Density `scale * softplus(raw - 4)` and the logarithm of its derivative, [...] each.
 
     Not `exp`: its log-derivative is `raw` itself, without bound, so that the reward for entropy
     would make everything unseen ever denser; here it is `log(scale)` at most. The shift makes a
@@ -70,9 +70,6 @@ def positive_density(raw: jax.Array, scale) -> tuple[jax.Array, jax.Array]:
     Args:
       raw: [...] any.
       scale: > 0, 1 / scene unit.
-
-    Returns:
-      density [...] and `log d density / d raw` [...].
     """
     shifted = raw - 4.0
     soft = nn.softplus(shifted)

@@ -118,11 +118,7 @@ def apply_flow(flow: SylvesterFlow, z: jax.Array, *, reverse: bool) -> tuple[jax
 def apply_flows(flows: SylvesterFlow, z: jax.Array) -> tuple[jax.Array, jax.Array]:
     """All F flows in turn, every other one on reversed coordinates, so that all of them mix.
 
-    Args:
-      z: [D, ...], broadcastable against the flows' points.
-
-    Returns:
-      `z'` [D, ...] and `log |det dz'/dz|` [...], summed over the flows.
+    Arguments and results are those of `apply_flow`, the logarithm summed over the flows.
     """
     log_dets = []
     for number, flow in enumerate(zip(*map(_unstack, flows))):

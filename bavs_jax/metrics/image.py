@@ -19,12 +19,7 @@ def quantise_uint8(image: Array) -> jax.Array:
     """What is left of an image once it is saved with 8 bits: `round(255 clip(image, 0, 1)) / 255`.
 
     Published numbers are measured on saved files (nerfbaselines' protocol), hence also these.
-
-    Args:
-      image: [...] sRGB, nominally in [0, 1].
-
-    Returns:
-      [...] float32, multiples of 1/255 in [0, 1].
+    The image [...] is sRGB, nominally in [0, 1].
     """
     return jnp.round(255.0 * jnp.clip(image, 0.0, 1.0)) / 255.0
 

@@ -27,13 +27,13 @@ class Outcome(NamedTuple):
     """What an objective found."""
 
     loss: jax.Array  # [] what is made small
-    rgb: jax.Array  # [R, 3] the rendered colours, for the report
+    rgb: jax.Array  # [P, 3] the colours of pixels, for the report
     weights: jax.Array  # [R, S] rendering weights, for the losses of samplers
     ray_mask: jax.Array  # [R] bool, false for rays that did not fit the sample buffer
 
 
 class Objective(Protocol):
-    """The loss of a field's parameters on a batch of R rays, seen at samples [R, S]."""
+    """The loss of a field's parameters on a batch of pixels, whose R rays are seen at [R, S]."""
 
     def __call__(
         self, key: jax.Array, params: Params, batch: PixelBatch, samples: Samples, /
@@ -69,8 +69,9 @@ def make_colour_objective(field: Field, *, capacity: int, mesh: Mesh | None = No
     def objective(key, params, batch, samples):
         del key
         out = render(params, batch, samples)
-        loss = colour_loss(out.rgb, batch.rgb, batch.ray_weight * out.ray_mask)
-        return Outcome(loss, out.rgb, out.weights, out.ray_mask)
+        rgb = batch.mean(out.rgb)
+        loss = colour_loss(rgb, batch.rgb, batch.pixel_weight * batch.whole(out.ray_mask))
+        return Outcome(loss, rgb, out.weights, out.ray_mask)
 
     return objective
 
@@ -105,14 +106,14 @@ def make_variance_objective(
     def objective(key, params, batch, samples):
         del key
         out = render(params, batch, samples)
-        ray_weight = batch.ray_weight * out.ray_mask
+        rgb, weight = batch.mean(out.rgb), batch.pixel_weight * batch.whole(out.ray_mask)
         weights = out.weights if through_weights else jax.lax.stop_gradient(out.weights)
         variance = rendered_variance(weights, out.values["beta"])
         variance = variance + jnp.square(1.0 - weights.sum(-1)) * MIN_VARIANCE
-        loss = gaussian_nll(out.rgb, batch.rgb, variance, ray_weight)
+        loss = gaussian_nll(rgb, batch.rgb, batch.mean(variance), weight)
         # Over all slots, the empty ones too: over the occupied alone it would thin out surfaces.
-        density = weighted_mean(out.density.mean(-1), ray_weight)
-        return Outcome(loss + density_weight * density, out.rgb, out.weights, out.ray_mask)
+        density = weighted_mean(batch.mean(out.density.mean(-1)), weight)
+        return Outcome(loss + density_weight * density, rgb, out.weights, out.ray_mask)
 
     return objective
 
@@ -149,16 +150,16 @@ def make_flow_objective(
 
     def objective(key, params, batch, samples):
         draws = render_draws(params, base_draws(key, num_draws), batch, samples)
-        ray_mask = draws.ray_mask[0]
+        ray_mask, rgb = draws.ray_mask[0], jax.vmap(batch.mean)(draws.rgb)
         loss = flow_loss(
-            draws.rgb,
+            rgb,
             batch.rgb,
-            batch.ray_weight * ray_mask,
+            batch.pixel_weight * batch.whole(ray_mask),
             draws.values["log_prob"],
             samples.sample_mask & ray_mask[:, None],
             entropy_weight=entropy_weight,
             floor=floor,
         )
-        return Outcome(loss, draws.rgb.mean(0), draws.weights.mean(0), ray_mask)
+        return Outcome(loss, rgb.mean(0), draws.weights.mean(0), ray_mask)
 
     return objective

@@ -31,6 +31,7 @@ class RayTraining(NamedTuple):
 
     objective: Objective  # from `objectives.py`
     num_rays: int  # R, rays of one step
+    rays_per_pixel: int = 1  # see `sample_pixels`
     random_background: bool = False  # see `sample_pixels`
     penalty_weight: float = 0.0  # of the field's own penalty
     # Of the field's roughness, for one training pixel: as a prior should, it counts the less the
@@ -80,7 +81,7 @@ class RayField:
     def loss(
         self, key, state: ModelState, table: PixelTable, is_training_view
     ) -> tuple[jax.Array, StepReport]:
-        """Of R random training pixels: the objective, and what field and sampler add to it."""
+        """Of random pixels, R rays in all: the objective, and what field and sampler add."""
         training, params = self._how_trained(), state.params
         pixel_key, sample_key, objective_key = jax.random.split(key, 3)
         batch = sample_pixels(
@@ -88,6 +89,7 @@ class RayField:
             table,
             is_training_view,
             training.num_rays,
+            rays_per_pixel=training.rays_per_pixel,
             background=self.background,
             random_background=training.random_background,
         )
@@ -98,11 +100,13 @@ class RayField:
             samples, fits = self._visible(
                 params["field"], batch.rays, samples, capacity=training.capacity_before_hiding
             )
-            batch = batch.replace(ray_weight=batch.ray_weight * fits)
+            batch = batch.replace(pixel_weight=batch.pixel_weight * batch.whole(fits))
         outcome = training.objective(objective_key, params["field"], batch, samples)
-        colour_loss_fn = partial(
-            colour_loss, target=batch.rgb, ray_weight=batch.ray_weight * outcome.ray_mask
-        )
+        pixel_weight = batch.pixel_weight * batch.whole(outcome.ray_mask)
+
+        def colour_loss_fn(ray_rgb):
+            return colour_loss(batch.mean(ray_rgb), batch.rgb, pixel_weight)
+
         loss = outcome.loss
         loss += self.sampler.loss(aux, samples, outcome.weights, colour_loss_fn)
         penalty = training.penalty_weight * self.field.penalty(params["field"])
@@ -111,7 +115,7 @@ class RayField:
             num_pixels = training_sizes(table, is_training_view).sum()
             penalty += training.roughness_weight / num_pixels * roughness
         return loss + penalty, StepReport(
-            loss=colour_loss_fn(outcome.rgb),
+            loss=colour_loss(outcome.rgb, batch.rgb, pixel_weight),
             rays=(outcome.ray_mask & fits).sum(),
             samples=(samples.sample_mask & outcome.ray_mask[:, None]).sum(),
             thinned=samples.thinned.mean(),

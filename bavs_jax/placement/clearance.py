@@ -44,7 +44,6 @@ def judge_positions(
 
     Args:
       positions: [N, 3] scene units.
-      density_fn: of any field.
       clearance: radius that must be free, scene units.
       solid_density: density from which on there is matter, 1 / scene unit; see `matter_density`.
       chunk: points of one call of `density_fn`, the last ones filled up.
@@ -81,7 +80,6 @@ def optical_depth(density_fn: DensityFn, starts, ends, *, num_samples: int = 64)
     """Light lost between pairs of points, `integral density dt`, by the midpoint rule, [N] nats.
 
     Args:
-      density_fn: of any field.
       starts, ends: [N, 3] scene units.
       num_samples: of each way.
     """

@@ -42,7 +42,6 @@ def count_seeing(cameras: Cameras, position, density_fn: DensityFn) -> int:
     Args:
       cameras: [V].
       position: [3] scene units.
-      density_fn: of any field.
 
     Numerics: lens distortion is left out, which moves the image's edge by a few pixels.
     """

@@ -67,7 +67,6 @@ def update_occupancy(
     `min(threshold, mean)`; the mean keeps a young, thin field from vanishing.
 
     Args:
-      density_fn: of the field.
       num_samples: cells looked at, drawn without regard to what they held.
       step_size: sample spacing along rays, scene units.
       decay: how fast a maximum is forgotten, in (0, 1).

@@ -197,7 +197,6 @@ def visible_samples(
     hidden. No gradient runs through this.
 
     Args:
-      density_fn: of the field.
       rays: R rays.
       samples: [R, S], not dense.
       capacity: samples whose density is evaluated.

@@ -58,19 +58,3 @@ def load_scene(kind: str, **options) -> Scene:
                 f"scene kind '{kind}': option {name} is unknown: use some of {', '.join(known)}"
             )
     return LOADERS[kind](**options)
-
-
-__all__ = [
-    "LOADERS",
-    "Scene",
-    "SceneError",
-    "detect_kind",
-    "load_blender",
-    "load_colmap",
-    "load_lightfield",
-    "load_llff",
-    "load_mipnerf360",
-    "load_nerfstudio",
-    "load_procedural",
-    "load_scene",
-]

@@ -88,8 +88,7 @@ class Scene:
 def photo_cameras(scene: Scene, cameras: Cameras) -> Cameras:
     """Cameras as one would take photos with them: at the sizes of the scene's files.
 
-    Args:
-      cameras: with the image sizes of some of its views, which may have been reduced.
+    The cameras given have the image sizes of some of its views, which may have been reduced.
     """
     if scene.photo_sizes is None:
         return cameras

@@ -74,13 +74,12 @@ def read_llff(root: pathlib.Path, *, downscale: int | None) -> Capture:
 def load_llff(root, *, downscale: int | None = None, **options) -> Scene:
     """Loads a scene in the layout of LLFF; every 8th image is a test view.
 
+    It is in normalised coordinates with +z up; near and far are the bounds'.
+
     Args:
       root: the folder of `poses_bounds.npy`.
       downscale: N takes the images of `images_N`; None those of `images`, or else the largest.
       **options: of `make_scene`.
-
-    Returns:
-      The scene, in normalised coordinates with +z up; near and far are the bounds'.
 
     Raises:
       SceneError: anything in the files that cannot be used.

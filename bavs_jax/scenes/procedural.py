@@ -20,6 +20,7 @@ from bavs_jax.cameras import (
     hemisphere_poses,
     make_cameras,
     pixel_rays,
+    subpixel_offsets,
     take,
     view_pixels,
 )
@@ -37,12 +38,6 @@ RAY_CHUNK = 1 << 11  # pixels per call, each with SUBSAMPLES**2 rays
 COLOUR_TOLERANCE = 3e-4  # scene units
 COLOUR_BISECTIONS = 6
 DEPTH_MIN_STEP = 1e-3  # scene units
-
-
-def subpixel_offsets() -> np.ndarray:
-    """Centres of an even grid within a pixel, relative to its centre, [SUBSAMPLES**2, 2]."""
-    steps = (np.arange(SUBSAMPLES) + 0.5) / SUBSAMPLES - 0.5
-    return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2).astype(np.float32)
 
 
 def components(vectors: Array) -> sdf.Point:
@@ -77,7 +72,7 @@ def pixel_cones(cameras: Cameras, pixels: jax.Array):
     """
     view_ids = jnp.arange(len(cameras))
     rays = pixel_rays(cameras, view_ids, pixels)
-    offsets = subpixel_offsets()
+    offsets = subpixel_offsets(SUBSAMPLES**2)
     apart = [
         jnp.linalg.norm(
             pixel_rays(cameras, view_ids, pixels + offsets[corner]).directions - rays.directions,
@@ -101,7 +96,7 @@ def first_touch(cameras: Cameras, pixels: jax.Array):
 
 def photograph(cameras: Cameras, pixels: jax.Array, t_start: jax.Array, spread: jax.Array):
     """Red, green, blue, opacity [N] in [0, 1], means over a pixel, and depth [N] at its centre."""
-    offsets = subpixel_offsets()
+    offsets = subpixel_offsets(SUBSAMPLES**2)
     num, sub = pixels.shape[0], offsets.shape[0]
     places = (offsets[:, None, :] + pixels[None]).reshape(-1, 2)
     rays = pixel_rays(cameras, jnp.tile(jnp.arange(num), sub), places)

@@ -23,9 +23,10 @@ def is_file(path: pathlib.Path) -> bool:
         return False
 
 
-def one_line(error: BaseException) -> str:
-    """A foreign error's message without its line breaks."""
-    return " ".join(str(error).split()) or type(error).__name__
+def one_line(error: BaseException, most: int | None = None) -> str:
+    """A foreign error's message without its line breaks, cut after `most` characters."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if most is None or len(text) <= most else f"{text[:most]} ..."
 
 
 def check_file(path: pathlib.Path) -> None:

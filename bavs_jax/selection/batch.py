@@ -201,29 +201,17 @@ def _choose_greedily(policy: Policy, key, ctx: Context, k: int):
     return np.array(selected), first_scores, np.array(selected_scores)
 
 
+def _cameras(ctx: Context) -> tuple[Array, Array, Array, Array]:
+    return ctx.positions, ctx.training_positions, ctx.is_training_view, ctx.mask
+
+
 def _max_min_survivors(ctx: Context, k: int, radii: Radii) -> tuple[np.ndarray, FilterInfo]:
-    survivors, info = _filter_fn(
-        ctx.positions,
-        ctx.training_positions,
-        ctx.is_training_view,
-        ctx.mask,
-        k,
-        view_ids=ctx.view_ids,
-        radii=radii,
-    )
+    survivors, info = _filter_fn(*_cameras(ctx), k, view_ids=ctx.view_ids, radii=radii)
     return np.asarray(survivors), jax.tree.map(lambda x: x.item(), info)
 
 
 def _farthest_ranks(ctx: Context, num_picks: int) -> np.ndarray:
-    ranks = _ranks_fn(
-        ctx.positions,
-        ctx.training_positions,
-        ctx.is_training_view,
-        ctx.mask,
-        num_picks,
-        view_ids=ctx.view_ids,
-    )
-    return np.asarray(ranks)
+    return np.asarray(_ranks_fn(*_cameras(ctx), num_picks, view_ids=ctx.view_ids))
 
 
 def _as_radii(radii: Radii | None, ctx: Context) -> Radii:

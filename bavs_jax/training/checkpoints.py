@@ -13,8 +13,11 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from bavs_jax.scenes.texts import one_line
+
 # What a checkpoint with damaged or missing files raises; no memory or no permission is none of it.
 DAMAGE = (ValueError, LookupError, TypeError, FileNotFoundError, NotADirectoryError)
+LONGEST_REASON = 200  # characters of an error in a message
 STRAGGLE_SECONDS = 0.3  # in which reads that were under way beside a failed one end, and complain
 
 
@@ -66,8 +69,9 @@ class Checkpoints:
                 )
                 self._manager.wait_until_finished()
         except (ValueError, OSError) as error:  # tensorstore has no error of its own
+            reason = one_line(error, LONGEST_REASON)
             raise OSError(
-                f"{self._folder}: checkpoint {number} cannot be written ({_in_one_line(error)}): "
+                f"{self._folder}: checkpoint {number} cannot be written ({reason}): "
                 "make room there, then start again"
             ) from error
 
@@ -101,8 +105,8 @@ class Checkpoints:
         names = (f"bad_{number}{f'_{i}' if i > 1 else ''}" for i in itertools.count(1))
         target = next(p for p in map(self._folder.joinpath, names) if not p.exists())
         self._warn_fn(
-            f"{self._folder / str(number)}: checkpoint is damaged ({_in_one_line(error)}): "
-            f"set aside as {target.name}"
+            f"{self._folder / str(number)}: checkpoint is damaged "
+            f"({one_line(error, LONGEST_REASON)}): set aside as {target.name}"
         )
         if jax.process_index() == 0:
             (self._folder / str(number)).rename(target)
@@ -119,8 +123,3 @@ def _without_tracebacks() -> Iterator[None]:
         yield
     finally:
         logger.disabled, sys.unraisablehook = before, hook
-
-
-def _in_one_line(error: Exception, most: int = 200) -> str:
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= most else f"{text[:most]} ..."

@@ -124,7 +124,9 @@ def make_train_fn(
     steps_per_call: int = 16,
     mesh: Mesh | None = None,
 ) -> TrainCall:
-    """Makes the compiled training function.
+    """Makes the compiled training function, of `steps_per_call` steps.
+
+    Views are a mask: more of them compile nothing anew.
 
     Args:
       model: what is trained; it draws its batches and says what is made small.
@@ -133,9 +135,6 @@ def make_train_fn(
         (see `average_weight`); 0 renders the last ones.
       steps_per_call: optimiser steps compiled together.
       mesh: devices that share the rays (see `devices.py`); the model must have the same.
-
-    Returns:
-      A `TrainCall` of `steps_per_call` steps. Views are a mask: more of them compile nothing anew.
     """
 
     def one_step(state: TrainState, key, table, is_training_view):

@@ -278,11 +278,7 @@ class CurvatureOfRays:
     ) -> jax.Array:
         """`jac_sq_sum` [G, 3], or with `group_ids` [N] that of each group, [group_size, G, 3].
 
-        Args:
-          rays: N rays.
-          label: of the progress; None: none is shown.
-          weighting: one of `curvature.WEIGHTINGS`.
-          **of_rays: see `RayFacts`.
+        The label is that of the progress; None shows none. For the rest, see `make_curvature_fn`.
         """
         if weighting not in self._made:
             self._made[weighting] = self._make(weighting=weighting)

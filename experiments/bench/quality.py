@@ -76,7 +76,12 @@ def measure_run(config, *, num_views: int, num_test_views: int, every: int, star
             if fitted.calls % calls_between == 0 or fitted.calls == num_calls:
                 jax.block_until_ready(fitted.train)
                 stopped = time.time()
-                measures = evaluate_views(problem.render(fitted.train), scene, view_ids)
+                measures = evaluate_views(
+                    problem.render(fitted.train),
+                    scene,
+                    view_ids,
+                    rays_per_pixel=config.rays_per_pixel,
+                )
                 seconds = stopped - started - paused
                 step = fitted.calls * steps
                 curve.append({"step": step, "seconds": seconds, "psnr": measures["psnr"]})

@@ -40,6 +40,9 @@ def get_config() -> ConfigDict:
     # "occupancy", "proposal" or "coarse_to_fine"; "": what suits field and scene.
     config.sampler_kind = ""
 
+    # Rays through each pixel, whose mean is its colour, in training and on test views: 1, 4 or 9.
+    config.rays_per_pixel = 4
+
     # --- field_kind "hash_grid" (fields/hash_grid.py) ---
     config.field = ConfigDict()
     config.field.num_levels = 8

@@ -15,6 +15,7 @@ def get_config():
     config.policies = ("bavs",)
     config.num_initial = 50
     config.num_rounds = 0
+    config.rays_per_pixel = 1
     config.field.finest = 512
     config.field.appearance_features = 4
     config.train.num_rays = 1024  # each with all of its samples

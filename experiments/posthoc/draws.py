@@ -71,11 +71,19 @@ def draw_views(
       The views in their order, and the scale.
     """
     train, cameras = run.state.train, run.state.table.cameras
-    total = int(np.diff(np.asarray(run.state.table.offsets))[view_ids].sum())
+    rays_per_pixel = run.config.rays_per_pixel
+    total = rays_per_pixel * int(np.diff(np.asarray(run.state.table.offsets))[view_ids].sum())
     jac_sq_sum = run_curvature(run)
     modes = run.problem.render(train, jac_sq_sum, run.num_rays)
     with track(total, f"{run.label}: {len(view_ids)} views", "rays") as bar:
-        images = render_views(modes, cameras, view_ids, chunk=RENDER_CHUNK, progress_fn=bar.advance)
+        images = render_views(
+            modes,
+            cameras,
+            view_ids,
+            chunk=RENDER_CHUNK,
+            rays_per_pixel=rays_per_pixel,
+            progress_fn=bar.advance,
+        )
     if scale is None:
         seen = set(run.training_views.tolist())
         squares = [
@@ -98,7 +106,12 @@ def draw_views(
                 return {"rgb": moved(rays)["rgb"]}
 
             rendered = render_views(
-                render_rgb, cameras, view_ids, chunk=RENDER_CHUNK, progress_fn=bar.advance
+                render_rgb,
+                cameras,
+                view_ids,
+                chunk=RENDER_CHUNK,
+                rays_per_pixel=rays_per_pixel,
+                progress_fn=bar.advance,
             )
             by_draw.append([image["rgb"] for image in rendered])
     views = []

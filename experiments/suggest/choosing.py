@@ -139,9 +139,16 @@ def holdout_quality(problem: Problem, train: TrainState) -> dict | None:
     scene = problem.scene
     if not len(scene.test):
         return None
-    num_rays = int(np.diff(scene.offsets)[scene.test].sum())
+    rays_per_pixel = problem.config.rays_per_pixel
+    num_rays = rays_per_pixel * int(np.diff(scene.offsets)[scene.test].sum())
     with track(num_rays, f"measure on {len(scene.test)} photos left out", "rays") as bar:
-        return evaluate_views(problem.render(train), scene, scene.test, progress_fn=bar.advance)
+        return evaluate_views(
+            problem.render(train),
+            scene,
+            scene.test,
+            rays_per_pixel=rays_per_pixel,
+            progress_fn=bar.advance,
+        )
 
 
 # --- the choice ------------------------------------------------------------------------------

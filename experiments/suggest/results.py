@@ -181,9 +181,16 @@ def make_rows(suggestion: Suggestion, order) -> list[dict]:
 def render_uncertain(problem: Problem, train, jac_sq_sum, cameras: Cameras, label: str) -> list:
     """Colour, opacity and uncertainty of every camera."""
     render = problem.render(train, jac_sq_sum, photo_rays(problem))
-    views = np.arange(len(cameras))
-    with track(int(num_pixels(cameras).sum()), label, "rays") as bar:
-        return render_views(render, cameras, views, chunk=RENDER_CHUNK, progress_fn=bar.advance)
+    rays_per_pixel = problem.config.rays_per_pixel
+    with track(rays_per_pixel * int(num_pixels(cameras).sum()), label, "rays") as bar:
+        return render_views(
+            render,
+            cameras,
+            np.arange(len(cameras)),
+            chunk=RENDER_CHUNK,
+            rays_per_pixel=rays_per_pixel,
+            progress_fn=bar.advance,
+        )
 
 
 def write_results(

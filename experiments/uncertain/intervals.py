@@ -88,7 +88,9 @@ def pixel_rule(num: int) -> str:
     )
 
 
-def sample_views(scene, render_fn, view_ids, num: int, label: str) -> tuple[dict, float]:
+def sample_views(
+    scene, render_fn, view_ids, num: int, label: str, *, rays_per_pixel: int = 1
+) -> tuple[dict, float]:
     """Renders at most `num` pixels of each view, drawn uniformly without replacement; 0: all.
 
     Args:
@@ -97,6 +99,7 @@ def sample_views(scene, render_fn, view_ids, num: int, label: str) -> tuple[dict
       view_ids: which views.
       num: pixels of a view.
       label: for progress.
+      rays_per_pixel: see `render_pixels`.
 
     Returns:
       `ViewSample` by view, and the seconds that rendering took.
@@ -111,13 +114,15 @@ def sample_views(scene, render_fn, view_ids, num: int, label: str) -> tuple[dict
             rows[view] = np.sort(rng.choice(size, num, replace=False))
     sizes = [len(chosen) for chosen in rows.values()]
     pixels = [image_pixels(*map(int, scene.cameras.sizes[v]))[rows[v]] for v in rows]
-    with track(sum(sizes), f"{label}: pixels of {len(sizes)} views", "rays") as bar:
+    num_rays = rays_per_pixel * sum(sizes)
+    with track(num_rays, f"{label}: pixels of {len(sizes)} views", "rays") as bar:
         images = render_pixels(
             render_fn,
             scene.cameras,
             np.repeat(np.asarray(view_ids, np.int32), sizes),
             np.concatenate(pixels),
             chunk=RENDER_CHUNK,
+            rays_per_pixel=rays_per_pixel,
             progress_fn=bar.advance,
         )
     seconds = time.perf_counter() - start

@@ -126,7 +126,12 @@ def _measure_intervals(config, scene, fitted, situation, folder, name: str, seed
     groups = intervals.split(scene, situation.is_training_view, options.num_interval_views, seed)
     label = f"{situation.label}: {name}"
     samples, seconds = intervals.sample_views(
-        scene, fitted.render, np.concatenate(groups), options.num_interval_pixels, label
+        scene,
+        fitted.render,
+        np.concatenate(groups),
+        options.num_interval_pixels,
+        label,
+        rays_per_pixel=fitted.rays_per_pixel,
     )
     calibration, numbers = intervals.calibrate_samples(
         groups, samples, scale=options.interval_scale, scale_depth=options.scale_depth
@@ -142,7 +147,7 @@ def _measure_intervals(config, scene, fitted, situation, folder, name: str, seed
     path = intervals.calibration_path(folder, name, seed)
     intervals.save_calibration(path, calibration, about)
     shown = groups.test[:1]
-    image = render_views(fitted.render, scene.cameras, shown, chunk=RENDER_CHUNK)[0]
+    (image,), _ = render_model(scene, fitted, shown, f"{label}: intervals")
     arrays = intervals.band_arrays(scene, calibration, int(shown[0]), image)
     return arrays, {"intervals": numbers, "interval_views": views}, seconds
 
@@ -196,6 +201,7 @@ class FittedModel(NamedTuple):
 
     render: Callable  # rays [chunk] -> images, those of `IMAGES` that the model has
     seconds: float  # that it took to fit
+    rays_per_pixel: int = 1  # see `render_views`
 
 
 def fit_model(problem: Problem, name: str, key, situation: Situation) -> FittedModel:
@@ -209,16 +215,21 @@ def fit_model(problem: Problem, name: str, key, situation: Situation) -> FittedM
         rendered = fns.render(fitted, situation.train, rays)
         return {k: rendered[k] for k in IMAGES if k in rendered}
 
-    return FittedModel(render, seconds)
+    return FittedModel(render, seconds, problem.config.rays_per_pixel)
 
 
 def render_model(scene, fitted: FittedModel, view_ids, label: str) -> tuple[list[dict], float]:
     """Renders whole views with a fitted model: the images of each, and the seconds it took."""
     start = time.perf_counter()
-    num_rays = int(np.diff(scene.offsets)[view_ids].sum())
+    num_rays = fitted.rays_per_pixel * int(np.diff(scene.offsets)[view_ids].sum())
     with track(num_rays, f"{label} on {len(view_ids)} views", "rays") as bar:
         rendered = render_views(
-            fitted.render, scene.cameras, view_ids, chunk=RENDER_CHUNK, progress_fn=bar.advance
+            fitted.render,
+            scene.cameras,
+            view_ids,
+            chunk=RENDER_CHUNK,
+            rays_per_pixel=fitted.rays_per_pixel,
+            progress_fn=bar.advance,
         )
     return rendered, time.perf_counter() - start
 

@@ -27,6 +27,7 @@ def blender_nerf() -> ConfigDict:
     config.nerf_mlp.position_degree = 10
     config.coarse_to_fine.num_coarse = 64
     config.coarse_to_fine.num_fine = 128
+    config.rays_per_pixel = 1  # as published
     config.train.num_rays = 4096
     config.train.capacity = 262_144
     config.train.learning_rate = 5e-4
@@ -71,6 +72,7 @@ def blender_mip() -> ConfigDict:
     config.proposal.num_samples = 32
     config.proposal.anneal_steps = 1000
     config.proposal.distortion_weight = 0.01
+    config.rays_per_pixel = 1  # as published
     config.train.num_rays = 16_384  # some 20 GB of activations; 4096 fit a smaller GPU
     config.train.capacity = 65_536
     config.train.learning_rate = 2e-3
