@@ -13,7 +13,7 @@ from absl import flags
 from ml_collections import config_flags
 
 from bavs_jax.selection.policies import POLICIES
-from experiments import job, runs, runtime
+from experiments import job, runner, runtime
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS
@@ -46,9 +46,9 @@ def main() -> None:
         runtime.end_with_parent()
     mesh = job.start_job()
     if FLAGS.part is not None:
-        runs.make_parts(config, folder, runtime.command_line(), only=FLAGS.part, mesh=mesh)
+        runner.make_parts(config, folder, runtime.command_line(), only=FLAGS.part, mesh=mesh)
     else:
-        runs.run_all(config, folder, runtime.command_line(), mesh)
+        runner.run_all(config, folder, runtime.command_line(), mesh)
 
 
 if __name__ == "__main__":

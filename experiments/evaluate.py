@@ -9,7 +9,7 @@ from PIL import Image
 from bavs_jax.metrics.image import depth_mae, measure_images
 from bavs_jax.rendering.images import render_views
 from experiments.build import RENDER_CHUNK
-from experiments.picture_stack import stack_pictures
+from experiments.files import stack_pictures
 from experiments.progress import track
 
 

@@ -1,4 +1,4 @@
-"""One run: a policy with a seed, from its last checkpoint to its result file."""
+"""A policy with a seed, from its last checkpoint to its result file; and all runs of a config."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from bavs_jax import active
 from bavs_jax.active import ActiveState, Choice
@@ -17,9 +18,9 @@ from bavs_jax.pixel_table import num_training_pixels
 from bavs_jax.training.checkpoints import Checkpoints
 from bavs_jax.training.fit import MAX_RESTARTS, fit
 from bavs_jax.uncertainty.model import Situation
-from experiments import acquisitions
-from experiments.build import Problem
-from experiments.build_scene import initial_views
+from experiments import acquisitions, runtime, workdir
+from experiments.build import Problem, build_problem
+from experiments.build_scene import check_views, initial_views, load_config_scene
 from experiments.errors import WorkdirError
 from experiments.evaluate import (
     measure_baselines,
@@ -27,13 +28,14 @@ from experiments.evaluate import (
     picture_arrays,
     spread_evenly,
 )
-from experiments.files import append_line, read_json, write_arrays, write_json
+from experiments.files import append_line, exclusive, read_json, write_arrays, write_json
 from experiments.keys import run_key, stream_key
 from experiments.progress import track
+from experiments.reporting.report import write_report
 from experiments.reporting.results import bound_words
 from experiments.runtime import device_name, peak_memory_mb, versions, warn
 from experiments.signals import as_first_process, is_first_process
-from experiments.workdir import Part, is_completed, is_finished
+from experiments.workdir import Part, all_parts, find_part, is_completed, is_finished
 
 SCHEMA_VERSION = 1
 LOG_EVERY = 10  # training calls between two lines of metrics.jsonl
@@ -335,3 +337,49 @@ def whole_state(problem: Problem, saved) -> ActiveState:
         calls=saved["calls"],
         restarts=saved["restarts"],
     )
+
+
+# --- all runs of a config ---
+
+
+def make_parts(
+    config, folder: pathlib.Path, command: str, only: str | None = None, mesh: Mesh | None = None
+) -> None:
+    """Every policy with every seed, each from the round 0 it shares; or only one part of that."""
+    parts = all_parts(config.policies, config.seeds)
+    if only is not None:
+        parts = [find_part(only, parts)]
+    workdir.check_claim(folder, config)
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
+    check_views(config, scene)
+    print(f"{scene.name}: {len(scene.pool)} views to choose from, {len(scene.test)} test views")
+    problems = {kind: build_problem(config, scene, kind, mesh) for kind in {p.kind for p in parts}}
+    workdir.claim(folder, config)
+
+    def make(part, shared=None) -> Run:
+        # Other processes may make other parts of the same folder, and need the same round 0.
+        with exclusive(folder / part.name):
+            run = Run(config, problems[part.kind], folder, part.policy, part.seed, command)
+            run.finish(shared)
+            return run
+
+    first_rounds = {}
+    for part in parts:
+        if part.initial not in first_rounds:
+            first_rounds[part.initial] = make(part.initial)
+        if part.policy is not None:
+            make(part, first_rounds[part.initial])
+            if only is None and is_first_process():
+                workdir.collect(folder)
+
+
+def run_all(config, folder: pathlib.Path, command: str, mesh: Mesh | None) -> None:
+    """All parts of a config, then the exported views and the report."""
+    start = time.monotonic()
+    make_parts(config, folder, command, mesh=mesh)
+    if not is_first_process():
+        return
+    next_views = workdir.export_next_views(folder, config.policies[0], config.seeds[0])
+    report = write_report(folder)
+    print(f"chosen poses: {next_views}")
+    print(f"report:       {report}  ({time.monotonic() - start:.0f} s in all)")

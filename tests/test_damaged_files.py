@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from bavs_jax.scenes import procedural
-from experiments import runs, runtime, workdir
+from experiments import runner, runtime, workdir
 from experiments.errors import ReportError, WorkdirError
 from experiments.files import append_line, read_arrays, read_json, write_arrays, write_json
 from experiments.reporting.report import write_report
@@ -30,12 +30,12 @@ PART = "bavs/seed_0"
 def run_all(cache):
     """`run_all(folder)`: the script's work; scene and compiled programs are made once."""
     config = toy_config(policies=("bavs",), **TINY)
-    scene = runs.load_config_scene(config, cache_dir=str(cache / "scenes"))
-    problem = runs.build_problem(config, scene)
+    scene = runner.load_config_scene(config, cache_dir=str(cache / "scenes"))
+    problem = runner.build_problem(config, scene)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runs, "load_config_scene", lambda *args, **options: scene)
-        patch.setattr(runs, "build_problem", lambda *args: problem)
-        yield lambda folder: runs.run_all(config, folder, "command", None)
+        patch.setattr(runner, "load_config_scene", lambda *args, **options: scene)
+        patch.setattr(runner, "build_problem", lambda *args: problem)
+        yield lambda folder: runner.run_all(config, folder, "command", None)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from experiments import runs
+from experiments import runner
 from experiments.sweeps.plan import StepCounter
 from tests.file_operations import watched
 from tests.toy_runs import TINY, same_results, toy_config
@@ -23,11 +23,11 @@ class Killed(BaseException):
 def run_all(monkeypatch, cache):
     """`run_all(folder)`: the script's work; scene and compiled programs are made once."""
     config = toy_config(policies=("bavs",), **TINY)
-    scene = runs.load_config_scene(config, cache_dir=str(cache / "scenes"))
-    problem = runs.build_problem(config, scene)
-    monkeypatch.setattr(runs, "load_config_scene", lambda *args, **options: scene)
-    monkeypatch.setattr(runs, "build_problem", lambda *args: problem)
-    return lambda folder: runs.run_all(config, folder, "command", None)
+    scene = runner.load_config_scene(config, cache_dir=str(cache / "scenes"))
+    problem = runner.build_problem(config, scene)
+    monkeypatch.setattr(runner, "load_config_scene", lambda *args, **options: scene)
+    monkeypatch.setattr(runner, "build_problem", lambda *args: problem)
+    return lambda folder: runner.run_all(config, folder, "command", None)
 
 
 @pytest.fixture

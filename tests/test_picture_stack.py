@@ -8,8 +8,7 @@ import pytest
 
 from bavs_jax.scenes import load_nerfstudio
 from experiments.evaluate import picture_arrays
-from experiments.files import write_arrays
-from experiments.picture_stack import cut_pictures
+from experiments.files import cut_pictures, write_arrays
 from experiments.reporting import pictures
 from experiments.reporting.results import load_pictures, load_runs
 from experiments.reporting.uncertainty import view_strips

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.errors import ReportError
-from experiments.files import load_arrays, read_versioned
-from experiments.picture_stack import cut_pictures
+from experiments.files import cut_pictures, load_arrays, read_versioned
 
 SCHEMA_VERSION = 1
 PICTURE_KEYS = ("view_ids", "names", "truth", "rgb", "error", "uncertainty", "round")

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedFormatter, FixedLocator, PercentFormatter
 
 from bavs_jax.metrics.ause import removal_fractions
-from experiments.picture_stack import cut_pictures
+from experiments.files import cut_pictures
 from experiments.reporting import plots
 from experiments.reporting.page import FOLDER, write_template
 from experiments.reporting.pictures import (

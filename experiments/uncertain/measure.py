@@ -23,9 +23,8 @@ from bavs_jax.uncertainty.bands import uncertainty_of
 from bavs_jax.uncertainty.model import Situation
 from experiments.build import RENDER_CHUNK, Problem
 from experiments.evaluate import mean_quality, spread_evenly
-from experiments.files import read_arrays, read_json, write_arrays, write_json
+from experiments.files import read_arrays, read_json, stack_pictures, write_arrays, write_json
 from experiments.keys import stream_key
-from experiments.picture_stack import stack_pictures
 from experiments.progress import track
 from experiments.reporting.uncertainty import write_page
 from experiments.reporting.uncertainty_tables import NAME, SCHEMA_VERSION, save_result
