@@ -146,7 +146,13 @@ def _measure_intervals(config, scene, fitted, situation, folder, name: str, seed
     path = intervals.calibration_path(folder, name, seed)
     intervals.save_calibration(path, calibration, about)
     shown = groups.test[:1]
-    (image,), _ = render_model(scene, fitted, shown, f"{label}: intervals")
+    image = render_views(
+        fitted.render,
+        scene.cameras,
+        shown,
+        chunk=RENDER_CHUNK,
+        rays_per_pixel=fitted.rays_per_pixel,
+    )[0]
     arrays = intervals.band_arrays(scene, calibration, int(shown[0]), image)
     return arrays, {"intervals": numbers, "interval_views": views}, seconds
 
