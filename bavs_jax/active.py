@@ -31,7 +31,7 @@ from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policy import Mode, Policy
 from bavs_jax.training.fit import Fitted
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.model import Situation
+from bavs_jax.uncertainty.model import Acquired
 
 
 class ActiveState(struct.PyTreeNode):
@@ -91,7 +91,7 @@ def select(key, state: ActiveState, acquisition: Acquisition) -> Choice:
     """
     propose_key, input_key, policy_key = jax.random.split(key, 3)
     candidates = acquisition.source.propose(propose_key, state.table, state.is_training_view)
-    situation = Situation(
+    acquired = Acquired(
         state.train,
         state.table,
         state.is_training_view,
@@ -100,7 +100,7 @@ def select(key, state: ActiveState, acquisition: Acquisition) -> Choice:
         label=acquisition.label,
     )
     start = time.perf_counter()
-    inputs = acquisition.inputs(acquisition.policy, input_key, situation, candidates)
+    inputs = acquisition.inputs(acquisition.policy, input_key, acquired, candidates)
     context = make_context(
         candidates.cameras.positions,
         view_ids=candidates.view_ids,

@@ -44,28 +44,28 @@ def num_shards(mesh: Mesh | None) -> int:
 
 
 def over_rays(
-    fn: Callable[Args, Result], mesh: Mesh | None, *, spread: tuple[bool, ...]
+    fn: Callable[Args, Result], mesh: Mesh | None, *, sharded: tuple[bool, ...]
 ) -> Callable[Args, Result]:
     """Runs `fn` on each device for that device's rays alone.
 
     Args:
       fn: pure; all that it returns has a leading axis of rays.
       mesh: see above.
-      spread: for each argument, whether its leading axes are rays, a multiple of the devices; the
+      sharded: for each argument, whether its leading axes are rays, a multiple of the devices; the
         others are given to each device whole. Derivatives by those are summed over the devices.
     """
     if mesh is None:
         return fn
-    specs = tuple(ONE_EACH if is_spread else ON_ALL for is_spread in spread)
+    specs = tuple(ONE_EACH if is_sharded else ON_ALL for is_sharded in sharded)
     # Nothing inside talks to other devices, so there is nothing that the check could find.
     return jax.shard_map(fn, mesh=mesh, in_specs=specs, out_specs=ONE_EACH, check_vma=False)
 
 
 def jit_over_rays(
-    fn: Callable[Args, Result], mesh: Mesh | None, *, spread: tuple[bool, ...]
+    fn: Callable[Args, Result], mesh: Mesh | None, *, sharded: tuple[bool, ...]
 ) -> Callable[Args, Result]:
     """Compiles `over_rays`; what it returns is whole on every device, and so in every process."""
-    fn_over_rays = over_rays(fn, mesh, spread=spread)
+    fn_over_rays = over_rays(fn, mesh, sharded=sharded)
 
     @functools.wraps(fn)  # traces and profiles bear the name of what they run
     def gathered(*args: Args.args, **kwargs: Args.kwargs) -> Result:
@@ -74,7 +74,7 @@ def jit_over_rays(
     return jax.jit(gathered)
 
 
-def spread_rays(tree, mesh: Mesh | None):
+def shard_rays(tree, mesh: Mesh | None):
     """In a compiled function: each device makes its own part of these arrays [R, ...]."""
     return _constrained(tree, mesh, ONE_EACH)
 

@@ -62,7 +62,7 @@ def safe_reciprocal(x: Array) -> jax.Array:
     return 1.0 / jnp.where(jnp.abs(x) < 1e-12, tiny, x)
 
 
-def computed_once(x: jax.Array) -> jax.Array:
+def materialize(x: jax.Array) -> jax.Array:
     """`x` [..., D] as it is, but stored where it is used many times.
 
     XLA for CPUs computes a cheap producer anew inside of each of its consumers, and drops

@@ -26,13 +26,13 @@ from bavs_jax.selection.information import (
 )
 from bavs_jax.selection.policy import Policy
 from bavs_jax.uncertainty.measures import TrueErrorFn
-from bavs_jax.uncertainty.model import ModelFns, Situation, Toolbox
+from bavs_jax.uncertainty.model import Acquired, ModelFns, SceneSetup
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from bavs_jax.uncertainty.posterior import curvature_factor, posterior_precision, prior_precision
 from bavs_jax.uncertainty.scoring import mean_uncertainty
 from bavs_jax.uncertainty.streaming import CurvatureRays, rays_through_pixels
 
-WEIGHTING = "eq13"  # of candidates: the only one that needs no photo
+WEIGHTING = "gauss_newton"  # of candidates: the only one that needs no photo
 
 
 class LookOptions(NamedTuple):
@@ -52,7 +52,7 @@ class PolicyInputs(NamedTuple):
 
 # What a policy needs to know of C candidates; what is missing in it is refused by name when the
 # policy asks for it.
-MakeInputs = Callable[[Policy, jax.Array, Situation, Candidates], PolicyInputs]
+MakeInputs = Callable[[Policy, jax.Array, Acquired, Candidates], PolicyInputs]
 
 
 class InputMaker:
@@ -60,7 +60,7 @@ class InputMaker:
 
     def __init__(
         self,
-        toolbox: Toolbox,
+        setup: SceneSetup,
         model_fns: Callable[[str], ModelFns],
         options: LookOptions,
         *,
@@ -73,11 +73,11 @@ class InputMaker:
         track: shows progress.
         true_error_fn: of a training state; None where candidates have no photos.
         """
-        self.toolbox, self.model_fns, self.options = toolbox, model_fns, options
+        self.setup, self.model_fns, self.options = setup, model_fns, options
         self.track, self.true_error_fn = track, true_error_fn
 
     def __call__(
-        self, policy: Policy, key, situation: Situation, candidates: Candidates
+        self, policy: Policy, key, acquired: Acquired, candidates: Candidates
     ) -> PolicyInputs:
         """What is missing here is refused by name when the policy asks for it."""
         seconds = dict.fromkeys(("curvature", "fit", "score"), 0.0)
@@ -89,28 +89,28 @@ class InputMaker:
         if self.true_error_fn is not None:
             makers["true_error_fn"] = partial(self._true_error, self.true_error_fn)
         fields = {
-            name: makers[name](policy, key, situation, candidates, seconds)
+            name: makers[name](policy, key, acquired, candidates, seconds)
             for name in sorted(policy.needs)
             if name in makers
         }
         return PolicyInputs(fields, seconds)
 
-    def _mean_uncertainty(self, policy, key, situation, candidates, seconds):
+    def _mean_uncertainty(self, policy, key, acquired, candidates, seconds):
         fns, options = self.model_fns(policy.uncertainty), self.options
         with _clock(seconds, "fit" if policy.uncertainty != "laplace" else "curvature"):
-            fitted = fns.fit(key, situation)
+            fitted = fns.fit(key, acquired)
 
         def mean_fn(indices, picked):
             with _clock(seconds, "score"):
                 known = fitted
                 if fns.condition is not None:
-                    known = fns.condition(fitted, situation.train, picked)
+                    known = fns.condition(fitted, acquired.train, picked)
                 small = reduced_cameras(take(candidates.cameras, indices), options.image_scale)
                 num_rays = int(num_pixels(small).sum())
-                label = f"{situation.label}: score {len(indices)} views"
+                label = f"{acquired.label}: score {len(indices)} views"
                 with self.track(num_rays, label, "rays") as bar:
                     return mean_uncertainty(
-                        lambda rays: fns.render(known, situation.train, rays),
+                        lambda rays: fns.render(known, acquired.train, rays),
                         small,
                         measure=policy.measure,
                         chunk=options.chunk,
@@ -119,35 +119,35 @@ class InputMaker:
 
         return mean_fn
 
-    def _information(self, policy, key, situation, candidates, seconds):
+    def _information(self, policy, key, acquired, candidates, seconds):
         with _clock(seconds, "curvature"):
-            jac_sq_sum = training_curvature(key, self.toolbox, situation, WEIGHTING)
+            jac_sq_sum = training_curvature(key, self.setup, acquired, WEIGHTING)
             precision = posterior_precision(
                 jac_sq_sum,
-                num_rays=situation.num_rays,
-                prior_weight=self.toolbox.laplace.prior_weight,
+                num_rays=acquired.num_rays,
+                prior_weight=self.setup.laplace.prior_weight,
                 weighting=WEIGHTING,
             )
-        return Information(precision, self._candidate_curvature(situation, candidates, seconds))
+        return Information(precision, self._candidate_curvature(acquired, candidates, seconds))
 
-    def _directional(self, policy, key, situation, candidates, seconds):
-        curvature_fn = self._candidate_curvature(situation, candidates, seconds)
+    def _directional(self, policy, key, acquired, candidates, seconds):
+        curvature_fn = self._candidate_curvature(acquired, candidates, seconds)
         with _clock(seconds, "curvature"):
             return directional_information(
-                self.toolbox,
-                situation,
+                self.setup,
+                acquired,
                 candidates.cameras,
                 curvature_fn,
                 image_scale=self.options.image_scale,
                 max_bytes=self.options.cache_bytes,
             )
 
-    def _true_error(self, true_error_fn, policy, key, situation, candidates, seconds):
-        return lambda indices: true_error_fn(situation.train, candidates.view_ids[indices])
+    def _true_error(self, true_error_fn, policy, key, acquired, candidates, seconds):
+        return lambda indices: true_error_fn(acquired.train, candidates.view_ids[indices])
 
-    def _candidate_curvature(self, situation, candidates, seconds):
+    def _candidate_curvature(self, acquired, candidates, seconds):
         dense = make_candidate_curvature_fn(
-            self.toolbox, situation, candidates.cameras, self.options.image_scale
+            self.setup, acquired, candidates.cameras, self.options.image_scale
         )
 
         def timed(indices):
@@ -156,15 +156,15 @@ class InputMaker:
 
         return make_cached_curvature_fn(
             timed,
-            num_vertices=self.toolbox.grid.num_vertices,
+            num_vertices=self.setup.grid.num_vertices,
             max_bytes=self.options.cache_bytes,
-            group_size=self.toolbox.curvature.group_size,
+            group_size=self.setup.curvature.group_size,
         )
 
 
 def directional_information(
-    toolbox: Toolbox,
-    situation: Situation,
+    setup: SceneSetup,
+    acquired: Acquired,
     cameras: Cameras,
     curvature_fn: CurvatureFn,
     *,
@@ -174,7 +174,7 @@ def directional_information(
     """What the training views have told about each side, and what C cameras would add.
 
     Args:
-      toolbox, situation: the field and its training views.
+      setup, acquired: the field and its training views.
       cameras: the candidates.
       curvature_fn: theirs, as in `Information`.
       image_scale: of the training views' width and height, as for candidates.
@@ -188,35 +188,35 @@ def directional_information(
 
     precision_fn = make_precision_fn(
         look_fn,
-        vertex_positions(toolbox.grid),
-        prior=prior_precision(toolbox.laplace.prior_weight),
+        vertex_positions(setup.grid),
+        prior=prior_precision(setup.laplace.prior_weight),
         max_bytes=max_bytes,
     )
     return DirectionalInformation(
-        training_looks(toolbox, situation, image_scale), look_fn, precision_fn
+        training_looks(setup, acquired, image_scale), look_fn, precision_fn
     )
 
 
-def training_looks(toolbox: Toolbox, situation: Situation, image_scale: float) -> tuple[Look, ...]:
+def training_looks(setup: SceneSetup, acquired: Acquired, image_scale: float) -> tuple[Look, ...]:
     """The curvature that each training view by itself has brought, at a reduced size.
 
     Of the same field and by the same rule as that of candidates, so that both can be compared; but
     a view that was trained on is read with its own code, and without its masked pixels.
     """
-    views = np.flatnonzero(situation.is_training_view)
-    view_rays = _make_view_rays_fn(situation.table.cameras, image_scale, situation.table)
+    views = np.flatnonzero(acquired.is_training_view)
+    view_rays = _make_view_rays_fn(acquired.table.cameras, image_scale, acquired.table)
     curvature_fn = make_cached_curvature_fn(
-        _make_curvature_fn(toolbox, situation, view_rays),
-        num_vertices=toolbox.grid.num_vertices,
+        _make_curvature_fn(setup, acquired, view_rays),
+        num_vertices=setup.grid.num_vertices,
         max_bytes=0,
-        group_size=toolbox.curvature.group_size,
+        group_size=setup.curvature.group_size,
     )
-    positions = np.asarray(situation.table.cameras.positions)[views]
+    positions = np.asarray(acquired.table.cameras.positions)[views]
     return tuple(Look(rows, h, place) for (rows, h), place in zip(curvature_fn(views), positions))
 
 
 def make_candidate_curvature_fn(
-    toolbox: Toolbox, situation: Situation, cameras: Cameras, image_scale: float
+    setup: SceneSetup, acquired: Acquired, cameras: Cameras, image_scale: float
 ) -> DenseCurvatureFn:
     """Makes the curvatures of candidates: what photos would add to the precision.
 
@@ -224,9 +224,9 @@ def make_candidate_curvature_fn(
     is scaled up to the pixels that the photo would have; it is in the unit of the posterior's
     precision, `(2 / R) jac_sq_sum` with the run's own R, and 0 outside of what counts
     (`LaplaceOptions.extent`). Rays of all n cameras share compiled calls; n is at most
-    `toolbox.curvature.group_size`.
+    `setup.curvature.group_size`.
     """
-    return _make_curvature_fn(toolbox, situation, _make_view_rays_fn(cameras, image_scale))
+    return _make_curvature_fn(setup, acquired, _make_view_rays_fn(cameras, image_scale))
 
 
 # The rays of reduced images: all N rays of n views, which view each is of [N] int32 from 0 on, and
@@ -235,18 +235,18 @@ ViewRays = Callable[[np.ndarray], tuple[CurvatureRays, np.ndarray, np.ndarray]]
 
 
 def _make_curvature_fn(
-    toolbox: Toolbox, situation: Situation, view_rays: ViewRays
+    setup: SceneSetup, acquired: Acquired, view_rays: ViewRays
 ) -> DenseCurvatureFn:
     """`make_candidate_curvature_fn` of the cameras of `view_rays`."""
     counts: Array | float = 1.0
-    if toolbox.laplace.extent == "box":
-        counts = vertices_in_box(toolbox.grid)[:, None]
+    if setup.laplace.extent == "box":
+        counts = vertices_in_box(setup.grid)[:, None]
 
     def curvature(indices):
         of_rays, places, scale = view_rays(indices)
         of_rays["group_ids"] = places
-        added = toolbox.curvature(situation.train.model, label=None, weighting=WEIGHTING, **of_rays)
-        scale = (curvature_factor(situation.num_rays, WEIGHTING) * scale).astype(np.float32)
+        added = setup.curvature(acquired.train.model, label=None, weighting=WEIGHTING, **of_rays)
+        scale = (curvature_factor(acquired.num_rays, WEIGHTING) * scale).astype(np.float32)
         return counts * scale[:, None, None] * added[: len(indices)]
 
     return curvature

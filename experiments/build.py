@@ -24,10 +24,10 @@ from bavs_jax.policy_inputs import InputMaker, LookOptions
 from bavs_jax.scenes import Scene
 from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
-from bavs_jax.training.fit import Trainer, colour_spread, is_stuck
+from bavs_jax.training.fit import Trainer, is_stuck, single_colour_error
 from bavs_jax.training.train import TrainInfo, TrainState
 from bavs_jax.uncertainty.measures import make_true_error_fn
-from bavs_jax.uncertainty.model import RECONSTRUCTION, LaplaceOptions, ModelFns, Toolbox
+from bavs_jax.uncertainty.model import RECONSTRUCTION, LaplaceOptions, ModelFns, SceneSetup
 from bavs_jax.uncertainty.models import MODELS
 from bavs_jax.uncertainty.models.laplace import laplace_variance
 from bavs_jax.uncertainty.posterior import default_prior_weight
@@ -86,7 +86,7 @@ class Problem:
         """Whether a field at the end of its round has learnt nothing."""
         if self.trainer.check_call is None:
             return False  # too short a round to have learnt anything
-        return is_stuck(info, colour_spread(state.table, state.is_training_view))
+        return is_stuck(info, single_colour_error(state.table, state.is_training_view))
 
     def render(self, train: TrainState, jac_sq_sum=None, num_rays: int = 0) -> Callable:
         """Makes `Rays` [chunk] -> images, with the uncertainty channel where curvature is given."""
@@ -118,14 +118,14 @@ class Problem:
     # --- uncertainty and choice ---
 
     @cached_property
-    def toolbox(self) -> Toolbox:
+    def setup(self) -> SceneSetup:
         """What uncertainty models may use."""
         config = self.config
 
-        def train(kind, key, situation):
-            return train_aside(config, self.trainers[kind], key, situation, kind, self.track)
+        def train(kind, key, acquired):
+            return train_aside(config, self.trainers[kind], key, acquired, kind, self.track)
 
-        return Toolbox(
+        return SceneSetup(
             models=self.models,
             flow=self.flow,
             kind=self.kind,
@@ -153,7 +153,7 @@ class Problem:
     def model_fns(self, name: str) -> ModelFns:
         """An uncertainty model of this scene, made when first asked for."""
         if name not in self._made_models:
-            self._made_models[name] = MODELS[name].make_fns(self.toolbox)
+            self._made_models[name] = MODELS[name].make_fns(self.setup)
         return self._made_models[name]
 
     @cached_property
@@ -166,7 +166,7 @@ class Problem:
                 self.render, self.scene, image_scale=image_scale, chunk=RENDER_CHUNK
             )
         return InputMaker(
-            self.toolbox,
+            self.setup,
             self.model_fns,
             LookOptions(image_scale=image_scale, chunk=RENDER_CHUNK),
             track=self.track,

@@ -70,7 +70,7 @@ def _make_field(config, scene: Scene, num_views: int, learned_variance: bool) ->
     common = {"learned_variance": learned_variance}
     if config.field_kind == "hash_grid":
         return make_hash_grid_field(
-            scene.box, contracted=scene.unbounded, num_views=num_views, **config.field, **common
+            scene.box, contracted=scene.unbounded, num_views=num_views, **config.hash_grid, **common
         )
     if config.field_kind == "nerf_mlp":
         return make_nerf_mlp_field(
@@ -94,7 +94,7 @@ def build_flow(config, scene: Scene) -> FlowField:
     common = {"contracted": scene.unbounded, **config.flow}
     if config.field_kind == "hash_grid":
         aside = ("appearance_features", "initial_optical_depth")
-        grid = {k: v for k, v in config.field.items() if k not in aside}
+        grid = {k: v for k, v in config.hash_grid.items() if k not in aside}
         return make_flow_field(scene.box, **grid, **common)
     trunk = config[config.field_kind]
     shape = {k: trunk[k] for k in ("depth", "width", "skip", "position_degree", "direction_degree")}

@@ -18,7 +18,7 @@ from bavs_jax.models.ray_field import RayField, RayTraining
 from bavs_jax.scenes import Scene
 from bavs_jax.training.fit import Trainer, check_call, fit
 from bavs_jax.training.train import TrainState, init_train_state, make_optimiser, make_train_fn
-from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE, Situation
+from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE, Acquired
 from experiments.build_field import build_field, field_background, learning_rate
 from experiments.errors import ConfigError
 from experiments.runtime import warn
@@ -109,9 +109,7 @@ def build_trainer(config, model: RayField) -> Trainer:
     )
 
 
-def train_aside(
-    config, trainer: Trainer, key, situation: Situation, kind: str, track
-) -> TrainState:
+def train_aside(config, trainer: Trainer, key, acquired: Acquired, kind: str, track) -> TrainState:
     """Trains a field beside the run's own, on the same views for as many steps.
 
     Raises:
@@ -120,14 +118,14 @@ def train_aside(
     steps = config.train.steps_per_call
     init_key, steps_key = jax.random.split(jax.random.fold_in(key, 0))
     state = trainer.init(init_key)
-    table, mask = situation.table, situation.is_training_view
-    with track(trainer.num_calls * steps, f"{situation.label}: train {kind}", "steps") as bar:
+    table, mask = acquired.table, acquired.is_training_view
+    with track(trainer.num_calls * steps, f"{acquired.label}: train {kind}", "steps") as bar:
         for fitted in fit(steps_key, trainer, state, table, mask, label=f"{kind} field"):
             state = fitted.train
             bar.advance(steps, loss=float(fitted.info.loss))
             if fitted.calls == 0:
                 warn(
-                    f"{situation.label}: the {kind} field is stuck: trained anew with another key "
+                    f"{acquired.label}: the {kind} field is stuck: trained anew with another key "
                     f"({fitted.restarts})"
                 )
     return state

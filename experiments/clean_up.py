@@ -25,12 +25,12 @@ from bavs_jax.rendering.images import render_views
 from bavs_jax.uncertainty.cleanup import (
     RULES,
     choose_threshold,
+    even_thresholds,
     make_cleaned_render_fn,
-    spread_thresholds,
     threshold_sigma,
 )
 from experiments.build import RENDER_CHUNK
-from experiments.evaluate import spread_evenly
+from experiments.evaluate import evenly_spaced
 from experiments.posthoc import script
 from experiments.progress import track
 from experiments.reporting.pictures import Panel, panel_table, psnr_words
@@ -65,9 +65,9 @@ def clean_run(run: TrainedRun) -> dict:
     """One run's numbers; writes its pictures."""
     variance = run_variance(run, run_curvature(run))
     unit = float(offset_unit(run.problem.scene.box))
-    thresholds = spread_thresholds(variance, FLAGS.num_thresholds, unit)
+    thresholds = even_thresholds(variance, FLAGS.num_thresholds, unit)
     cleaned = make_cleaned_chunk_fn(run, variance)
-    test_views = spread_evenly(run.problem.scene.test, FLAGS.num_test)
+    test_views = evenly_spaced(run.problem.scene.test, FLAGS.num_test)
     train, test = (
         sweep_views(cleaned, run, views, thresholds, f"{len(views)} {name} views")
         for name, views in (("training", run.training_views), ("test", test_views))
@@ -78,12 +78,12 @@ def clean_run(run: TrainedRun) -> dict:
     folder = run.folder / "cleanup"
     save_figure(sweep_figure(train, test, row), folder / "sweep.png")
     save_figure(
-        views_figure(run, cleaned, spread_evenly(test_views, NUM_PICTURES), threshold),
+        views_figure(run, cleaned, evenly_spaced(test_views, NUM_PICTURES), threshold),
         folder / "views.png",
     )
     print(f"pictures: {folder / 'sweep.png'}, {folder / 'views.png'}")
     options = {**choice, "min_opacity": FLAGS.min_opacity, "num_test": len(test_views)}
-    laplace = run.toolbox.laplace
+    laplace = run.setup.laplace
     sweeps = {
         name: {key: [_number(x) for x in values] for key, values in sweep._asdict().items()}
         for name, sweep in (("training", train), ("test", test))
@@ -115,7 +115,7 @@ def _number(value) -> float | None:
 
 def make_cleaned_chunk_fn(run: TrainedRun, variance) -> Callable:
     """Makes `cleaned(thresholds [T]) -> (Rays [chunk] -> dict)` of a run's field."""
-    tools, train = run.toolbox, run.state.train
+    tools, train = run.setup, run.state.train
     options = {"variant": tools.laplace.variant, "extent": tools.laplace.extent}
     render = make_cleaned_render_fn(tools.model, tools.grid, **options)
 
@@ -154,7 +154,7 @@ def sweep_views(cleaned: Callable, run: TrainedRun, view_ids, thresholds, label:
             )
             mask = run.pixel_mask(view)
             counted = {name: value[mask] for name, value in images.items()}
-            options = {"background": run.toolbox.model.background, "min_opacity": FLAGS.min_opacity}
+            options = {"background": run.setup.model.background, "min_opacity": FLAGS.min_opacity}
             sums.append(pixel_sums(counted, run.truth(view)[mask], **options))
     return sweep_of(thresholds, sums)
 

@@ -60,7 +60,7 @@ def _kept_pixels(scene, view: int) -> np.ndarray:
     return rows if scene.pixel_mask is None else rows[scene.pixel_mask[scene.view_slice(view)]]
 
 
-def spread_evenly(view_ids, num: int) -> np.ndarray:
+def evenly_spaced(view_ids, num: int) -> np.ndarray:
     """`num` of the views, evenly spaced in their order; all of them if `num` is 0."""
     view_ids = np.asarray(view_ids)
     if num == 0 or num >= len(view_ids):
@@ -109,11 +109,11 @@ def measure_test_views(problem, train, num: int, label: str) -> dict:
     Args:
       problem: from `build_problem`.
       train: `TrainState`.
-      num: of the test views; see `spread_evenly`.
+      num: of the test views; see `evenly_spaced`.
       label: of the progress bar.
     """
     scene = problem.scene
-    view_ids = spread_evenly(scene.test, num)
+    view_ids = evenly_spaced(scene.test, num)
     rays_per_pixel = problem.config.rays_per_pixel
     num_rays = rays_per_pixel * int(sum(np.diff(scene.offsets)[view_ids]))
     with track(num_rays, f"{label}: {len(view_ids)} test views", "rays") as bar:

@@ -200,15 +200,15 @@ def slices_figure(axes, grid: dict, box) -> Figure:
 
 def write_points(folder: pathlib.Path, run: TrainedRun, point_fn: Callable) -> dict:
     """`points.ply`: where training rays end, with rendered colour and uncertainty there."""
-    scene, situation = run.problem.scene, run.situation
-    view_ids, pixel_ids = training_pixels(situation.table, situation.is_training_view)
+    scene, acquired = run.problem.scene, run.acquired
+    view_ids, pixel_ids = training_pixels(acquired.table, acquired.is_training_view)
     if FLAGS.max_points and len(view_ids) > FLAGS.max_points:
         rows = np.random.default_rng(run.seed).permutation(len(view_ids))[: FLAGS.max_points]
         view_ids, pixel_ids = (x[np.sort(rows)] for x in (view_ids, pixel_ids))
     with track(len(view_ids), "follow training rays", "rays") as bar:
         positions, rgb = ray_end_points(
-            run.problem.render(situation.train),
-            situation.table,
+            run.problem.render(acquired.train),
+            acquired.table,
             view_ids,
             pixel_ids,
             chunk=RENDER_CHUNK,

@@ -14,7 +14,7 @@ import numpy as np
 from absl import flags
 from matplotlib.figure import Figure
 
-from experiments.evaluate import spread_evenly
+from experiments.evaluate import evenly_spaced
 from experiments.posthoc import script
 from experiments.posthoc.draws import (
     ViewDraws,
@@ -60,14 +60,14 @@ def draw_run(run: TrainedRun) -> dict:
     """One run's numbers; writes its picture."""
     test = run.problem.scene.test
     far = farthest_view(run, test)
-    seen = spread_evenly(run.training_views, FLAGS.num_views)
-    held_out = np.union1d(spread_evenly(test, FLAGS.num_views), [far])
+    seen = evenly_spaced(run.training_views, FLAGS.num_views)
+    held_out = np.union1d(evenly_spaced(test, FLAGS.num_views), [far])
     views, scale = draw_views(
         run,
         np.concatenate([seen, held_out]),
         num_draws=FLAGS.num_draws,
         scale=FLAGS.scale or None,
-        limit=largest_offset(run.toolbox.grid, FLAGS.limit),
+        limit=largest_offset(run.setup.grid, FLAGS.limit),
     )
     split = {"training": views[: len(seen)], "test": views[len(seen) :]}
     split["farthest"] = [view for view in split["test"] if view.view_id == far]

@@ -17,16 +17,16 @@ from bavs_jax.devices import num_shards
 from bavs_jax.pixel_table import num_training_pixels
 from bavs_jax.training.checkpoints import Checkpoints
 from bavs_jax.training.fit import MAX_RESTARTS, fit
-from bavs_jax.uncertainty.model import Situation
+from bavs_jax.uncertainty.model import Acquired
 from experiments import acquisitions, runtime, workdir
 from experiments.build import Problem, build_problem
 from experiments.build_scene import check_views, initial_views, load_config_scene
 from experiments.errors import WorkdirError
 from experiments.evaluate import (
+    evenly_spaced,
     measure_baselines,
     measure_test_views,
     picture_arrays,
-    spread_evenly,
 )
 from experiments.files import append_line, exclusive, read_json, write_arrays, write_json
 from experiments.keys import run_key, stream_key
@@ -201,14 +201,14 @@ class Run:
         """Renders colour and uncertainty (Fig 4) of a state that may come from disk."""
         num_rays = int(num_training_pixels(self.problem.scene, self.initial).sum())
         fns = self.problem.model_fns("laplace")
-        situation = Situation(
+        acquired = Acquired(
             state.train,
             state.table,
             state.is_training_view,
             num_rays,
             label=f"{self.label}: pictures",
         )
-        fitted = fns.fit(stream_key(self.seed, "pictures"), situation)
+        fitted = fns.fit(stream_key(self.seed, "pictures"), acquired)
         return partial(fns.render, fitted, state.train)
 
     # --- files ---
@@ -240,7 +240,7 @@ class Run:
         scene, config = self.problem.scene, self.config
         path, pictures_path = self.folder / "result.json", self.folder / "pictures.npz"
         if completed and (self.seed == config.seeds[0] or pictures_path.exists()):
-            view_ids = spread_evenly(scene.test, config.num_pictures)
+            view_ids = evenly_spaced(scene.test, config.num_pictures)
             pictures = picture_arrays(
                 self._uncertain_render_fn(state),
                 scene,
@@ -292,7 +292,7 @@ class Run:
         """Of the last round's test views; pictures taken on the way are left out."""
         scene = self.problem.scene
         used = np.concatenate([row["selected"] for row in self.rounds]).astype(int)
-        test_views = spread_evenly(scene.test, self.config.num_test_final)
+        test_views = evenly_spaced(scene.test, self.config.num_test_final)
         return measure_baselines(scene, used[used < scene.num_views], test_views)
 
     def _log(self, **values) -> None:

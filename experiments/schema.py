@@ -148,16 +148,16 @@ SCHEMA = {
     "field_kind": choice(*SAMPLERS),
     "sampler_kind": choice("", *sorted({*itertools.chain(*SAMPLERS.values())})),
     "rays_per_pixel": RAYS_PER_PIXEL,
-    "field.num_levels": LEVELS,
-    "field.coarsest": RESOLUTION,
-    "field.finest": RESOLUTION,
-    "field.features": whole(1, 64),
-    "field.log2_table_size": TABLE,
-    "field.width": WIDTH,
-    "field.geometry_features": WIDTH,
-    "field.initial_optical_depth": number(1e-6, 1e3),
-    "field.direction_degree": whole(1, 4),
-    "field.appearance_features": whole(1, 1024, "none"),
+    "hash_grid.num_levels": LEVELS,
+    "hash_grid.coarsest": RESOLUTION,
+    "hash_grid.finest": RESOLUTION,
+    "hash_grid.features": whole(1, 64),
+    "hash_grid.log2_table_size": TABLE,
+    "hash_grid.width": WIDTH,
+    "hash_grid.geometry_features": WIDTH,
+    "hash_grid.initial_optical_depth": number(1e-6, 1e3),
+    "hash_grid.direction_degree": whole(1, 4),
+    "hash_grid.appearance_features": whole(1, 1024, "none"),
     "nerf_mlp.depth": LAYERS,
     "nerf_mlp.width": WIDTH,
     "nerf_mlp.skip": SKIP,
@@ -250,8 +250,20 @@ def given_config(example: str = "") -> ConfigDict | None:
         raise ConfigError(f"--config: {one_line(error)}") from None
 
 
+# What options were called, and what is read in place of it.
+OLD_VALUES = {
+    "uncertainty.weighting": {
+        "eq13": "gauss_newton",
+        "eq11": "residual_weighted",
+        "empirical": "empirical_fisher",
+    }
+}
+
+
 def check_config(config: ConfigDict, *more: str, name: str = "config") -> ConfigDict:
     """The config itself, once every option is of its type, within its range and fits the others.
+
+    Old names of values are replaced.
 
     Args:
       config: from `experiments.configs`, with what flags have changed.
@@ -261,9 +273,19 @@ def check_config(config: ConfigDict, *more: str, name: str = "config") -> Config
     Raises:
       ConfigError: the first option that cannot be used.
     """
+    _use_new_names(config)
     values = check_options(config, SCHEMA | {option: views("none") for option in more}, name)
     _check_together(values, name)
     return config
+
+
+def _use_new_names(config: ConfigDict) -> None:
+    for option, names in OLD_VALUES.items():
+        group, _, name = option.rpartition(".")
+        part = config.get(group) if isinstance(config, ConfigDict) else None
+        value = part.get(name) if isinstance(part, ConfigDict) else None
+        if isinstance(value, str) and value in names:
+            part[name] = names[value]
 
 
 def check_options(config: ConfigDict, schema: dict[str, Option], name: str) -> dict:
@@ -287,7 +309,7 @@ def check_options(config: ConfigDict, schema: dict[str, Option], name: str) -> d
 
 
 def _check_together(values: dict, name: str) -> None:
-    for group in ("field", "proposal"):
+    for group in ("hash_grid", "proposal"):
         coarsest, finest = values[f"{group}.coarsest"], values[f"{group}.finest"]
         if min(finest if isinstance(finest, tuple) else (finest,)) < coarsest:
             raise ConfigError(

@@ -13,7 +13,7 @@ from ml_collections import ConfigDict
 from bavs_jax.active import ActiveState
 from bavs_jax.pixel_table import num_training_pixels
 from bavs_jax.selection.policies import POLICIES, get_policy
-from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation, Toolbox
+from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired, SceneSetup
 from bavs_jax.uncertainty.models.laplace import laplace_variance, training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
 from experiments.build import Problem
@@ -44,14 +44,14 @@ class TrainedRun(NamedTuple):
         return f"{self.policy} seed {self.seed}"
 
     @property
-    def toolbox(self) -> Toolbox:
-        return self.problem.toolbox
+    def setup(self) -> SceneSetup:
+        return self.problem.setup
 
     @property
-    def situation(self) -> Situation:
+    def acquired(self) -> Acquired:
         state = self.state
         known = (state.train, state.table, state.is_training_view, self.num_rays)
-        return Situation(*known, label=self.label)
+        return Acquired(*known, label=self.label)
 
     @property
     def training_views(self) -> np.ndarray:
@@ -90,7 +90,10 @@ def saved_config(workdir: pathlib.Path) -> ConfigDict:
     config = base.get_config()
     config.lock()
     try:
-        config.update(_with_tuples(json.loads(path.read_text(encoding="utf-8"))))
+        saved = json.loads(path.read_text(encoding="utf-8"))
+        if "field" in saved:  # the group's name before
+            saved["hash_grid"] = saved.pop("field")
+        config.update(_with_tuples(saved))
     except FileNotFoundError as error:
         raise WorkdirError(
             f"{path}: does not exist: give the --workdir of a run, or a --config to start one"
@@ -193,18 +196,18 @@ def run_curvature(run: TrainedRun) -> jax.Array:
     """`jac_sq_sum` [G, 3] of the training rays, with progress."""
     # The key of the run's own pictures, so that the same uncertainty comes out.
     key = stream_key(run.seed, "pictures")
-    toolbox = run.toolbox
-    return training_curvature(key, toolbox, run.situation, toolbox.laplace.weighting)
+    setup = run.setup
+    return training_curvature(key, setup, run.acquired, setup.laplace.weighting)
 
 
 def run_variance(run: TrainedRun, jac_sq_sum: jax.Array) -> jax.Array:
     """The vertex variance [G] that the run's uncertainty channel interpolates."""
-    return laplace_variance(jac_sq_sum, run.num_rays, run.toolbox.laplace)
+    return laplace_variance(jac_sq_sum, run.num_rays, run.setup.laplace)
 
 
 def run_precision(run: TrainedRun, jac_sq_sum: jax.Array) -> jax.Array:
     """H of the run's posterior, [G, 3] (Eq 13)."""
-    options = run.toolbox.laplace
+    options = run.setup.laplace
     return posterior_precision(
         jac_sq_sum,
         num_rays=run.num_rays,

@@ -105,11 +105,11 @@ def main(out):
     grid = DeformationGrid(jnp.asarray(scene.box), 2)
     model, trained = models["colour"], states["colour"].model
     curvature_fn = make_curvature_fn(model, grid, chunk_samples=256, mesh=mesh)
-    pixels = table_rays(table, *training_pixels(table, mask), "eq13")
+    pixels = table_rays(table, *training_pixels(table, mask), "gauss_newton")
     curvature = curvature_fn(trained, **pixels)[0]
     found["curvature"] = np.asarray(curvature)
     variance = vertex_variance(
-        curvature, num_rays=100, prior_weight=1e-4, weighting="eq13", variant="posterior"
+        curvature, num_rays=100, prior_weight=1e-4, weighting="gauss_newton", variant="posterior"
     )
     render_chunk = make_render_chunk_fn(model, grid, variant="posterior", scale="log", mesh=mesh)
     found["scores"] = mean_uncertainty(

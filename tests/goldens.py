@@ -42,10 +42,10 @@ CASES = {
     },
     "mip_mlp": {"field_kind": "mip_mlp", **SMALL_NETWORKS},
     "poses on a hemisphere": {"candidates__source": "hemisphere", "num_rounds": 1},
-    "training on": {"from_scratch": "False", "uncertainty__weighting": "eq11"},
+    "training on": {"from_scratch": "False", "uncertainty__weighting": "residual_weighted"},
     "bayesrays": {
         "uncertainty__variant": "bayesrays",
-        "uncertainty__weighting": "empirical",
+        "uncertainty__weighting": "empirical_fisher",
         "uncertainty__scale": "sigma",
         "uncertainty__max_rays": 100,
         "num_rounds": 1,

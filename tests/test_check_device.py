@@ -56,7 +56,7 @@ def test_a_device_that_computes_something_else_is_found_out(monkeypatch):
         calls.append(config)
         if len(calls) == 2:
             config = config.copy_and_resolve_references()
-            config.uncertainty.weighting = "empirical"
+            config.uncertainty.weighting = "empirical_fisher"
         return original(config, *args)
 
     monkeypatch.setattr(same_numbers, "build_problem", other_second_time)

@@ -15,9 +15,9 @@ from bavs_jax.metrics.covered import PixelSums, Sweep, is_empty, pixel_sums, swe
 from bavs_jax.uncertainty.channel import vertex_variance
 from bavs_jax.uncertainty.cleanup import (
     choose_threshold,
+    even_thresholds,
     make_cleaned_render_fn,
     make_point_uncertainty_fn,
-    spread_thresholds,
     threshold_sigma,
 )
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
@@ -111,7 +111,7 @@ def variance():
         raw_sum(rays),
         num_rays=len(rays.origins),
         prior_weight=1e-6,
-        weighting="eq13",
+        weighting="gauss_newton",
         variant="posterior",
     )
 
@@ -131,7 +131,7 @@ def render(cleaned_fn, variance):
 @pytest.fixture(scope="module")
 def chosen(render, variance):
     """The sweep of the training rays and the threshold that the rule takes."""
-    thresholds = spread_thresholds(variance, 20, offset_unit(BOX))
+    thresholds = even_thresholds(variance, 20, offset_unit(BOX))
     rays = rays_to_wall()
     images = render(thresholds, rays)
     truth = images["rgb"][:, -1]
@@ -242,7 +242,7 @@ def test_a_sweep_compiles_once(cleaned_fn, render, variance):
 
 
 def test_thresholds_span_the_vertices_and_mean_a_length():
-    thresholds = spread_thresholds(100.0 * jnp.array([1e-4, 1.0, 1e8]), 5, 10.0)
+    thresholds = even_thresholds(100.0 * jnp.array([1e-4, 1.0, 1e8]), 5, 10.0)
     # log10 sigma in tens of units is -2, 0 and 4: 1/9, 3/9 and 7/9 on [0, 1].
     np.testing.assert_allclose(thresholds[:-1], np.linspace(1 / 9, 7 / 9, 5), rtol=1e-6)
     assert np.isposinf(thresholds[-1])

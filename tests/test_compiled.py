@@ -180,12 +180,12 @@ def composited(widths, weights, colours):
 
 
 def resampled(widths, weights):
-    places = histograms.even_places(None, len(widths), 4)
+    places = histograms.stratified_quantiles(None, len(widths), 4)
     return histograms.sample_histogram(edges(widths), weights, places)
 
 
 def weighted_jacobian(jacobian, colours):
-    return curvature.weight_jacobian(jacobian, colours, "eq11").sum((1, 2))
+    return curvature.weight_jacobian(jacobian, colours, "residual_weighted").sum((1, 2))
 
 
 CASES = {

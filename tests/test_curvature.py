@@ -147,11 +147,13 @@ def test_weightings_agree_with_the_dense_jacobian(x64):
     _, rgb = defined_jacobian(smooth_field_fn, rays, samples, background=BACKGROUND)
     residual = rgb - target
     eps = jnp.square(residual).sum(-1)
-    want_eq11 = jnp.einsum("r,rcvd->vd", eps, dense**2)
+    want_residual_weighted = jnp.einsum("r,rcvd->vd", eps, dense**2)
     want_empirical = jnp.square(jnp.einsum("rc,rcvd->rvd", residual, dense)).sum(0)
-    got_eq11 = raw_sum(grid, rays, samples, target=target, weighting="eq11")
-    got_empirical = raw_sum(grid, rays, samples, target=target, weighting="empirical")
-    np.testing.assert_allclose(got_eq11, want_eq11, atol=1e-10)
+    got_residual_weighted = raw_sum(
+        grid, rays, samples, target=target, weighting="residual_weighted"
+    )
+    got_empirical = raw_sum(grid, rays, samples, target=target, weighting="empirical_fisher")
+    np.testing.assert_allclose(got_residual_weighted, want_residual_weighted, atol=1e-10)
     np.testing.assert_allclose(got_empirical, want_empirical, atol=1e-10)
 
 
@@ -176,18 +178,18 @@ def test_one_ray_one_sample_by_hand(x64):
     np.testing.assert_allclose(added[0], np.tile(want, (8, 1)), atol=1e-15)
 
 
-def test_empirical_tends_to_eq13_and_eq11_to_three_times_it(x64):
+def test_the_empirical_fisher_tends_to_gauss_newton_and_residual_weighted_to_three_times_it(x64):
     """For e ~ N(0, I/2): E[e e^T] = I/2 and E|e|^2 = 3/2; factors 2, 4 and 4 make 1, 3 and 1."""
     jacobian = jax.random.normal(jax.random.key(5), (1, 3, 1, 3))
-    eq13 = 2.0 * jnp.square(jacobian).sum()
+    gauss_newton = 2.0 * jnp.square(jacobian).sum()
     draws = 20_000
     residual = jax.random.normal(jax.random.key(6), (draws, 3)) * np.sqrt(0.5)
     repeated = jnp.repeat(jacobian, draws, axis=0)
-    for weighting, factor in (("empirical", 1.0), ("eq11", 3.0)):
+    for weighting, factor in (("empirical_fisher", 1.0), ("residual_weighted", 3.0)):
         squares = 4.0 * jnp.square(weight_jacobian(repeated, residual, weighting)).sum((1, 2, 3))
         standard_error = squares.std() / np.sqrt(draws)
         # Four standard errors: a false alarm once in 16,000 seeds, and the seed is fixed.
-        np.testing.assert_allclose(squares.mean(), factor * eq13, atol=4 * standard_error)
+        np.testing.assert_allclose(squares.mean(), factor * gauss_newton, atol=4 * standard_error)
 
 
 def test_ray_order_and_padding_do_not_matter(x64):
@@ -204,7 +206,7 @@ def test_ray_order_and_padding_do_not_matter(x64):
 
 
 def test_unknown_weighting_and_missing_residual_are_errors():
-    with pytest.raises(ValueError, match="use one of eq13"):
+    with pytest.raises(ValueError, match="use one of gauss_newton"):
         weight_jacobian(jnp.ones((1, 3, 1, 3)), None, "eq12")
     with pytest.raises(ValueError, match="needs the colour residual"):
-        weight_jacobian(jnp.ones((1, 3, 1, 3)), None, "eq11")
+        weight_jacobian(jnp.ones((1, 3, 1, 3)), None, "residual_weighted")

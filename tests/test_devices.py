@@ -102,7 +102,7 @@ def test_curvature_scores_and_choice_are_equal(found, devices):
 
 def test_a_single_device_needs_no_mesh():
     assert make_mesh(1) is None and num_shards(None) == 1
-    assert over_rays(abs, None, spread=(True,)) is abs
+    assert over_rays(abs, None, sharded=(True,)) is abs
     tree = {"a": np.ones(2)}
     assert put_on_all(tree, None) is tree
 

@@ -13,7 +13,7 @@ from bavs_jax.fields.base import Field
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 from bavs_jax.uncertainty.draws import (
-    colour_spread,
+    colour_deviation,
     draw_offsets,
     make_displaced_render_fn,
     noise_scale,
@@ -131,7 +131,7 @@ def test_draws_compile_once(displaced):
 def test_colour_spread_by_hand():
     rgb = np.zeros((2, 1, 3))
     rgb[1, 0] = [0.2, 0.0, 0.4]  # unbiased variances 0.02, 0 and 0.08
-    np.testing.assert_allclose(colour_spread(rgb), [np.sqrt(0.1 / 3)], rtol=1e-6)
+    np.testing.assert_allclose(colour_deviation(rgb), [np.sqrt(0.1 / 3)], rtol=1e-6)
 
 
 def test_measures_are_over_covered_pixels():
@@ -205,7 +205,7 @@ def spread_of_side():
 
     def spread(side):
         rgb = [render(NOTHING_LEARNT, theta, rays_from(side))["rgb"] for theta in thetas]
-        return np.asarray(colour_spread(jnp.stack(rgb)))
+        return np.asarray(colour_deviation(jnp.stack(rgb)))
 
     return spread, noise
 

@@ -15,12 +15,12 @@ from bavs_jax.training.fit import (
     MAX_RESTARTS,
     Trainer,
     check_call,
-    colour_spread,
     fit,
     is_stuck,
+    single_colour_error,
 )
 from bavs_jax.training.train import TrainInfo, TrainState
-from bavs_jax.uncertainty.model import Situation
+from bavs_jax.uncertainty.model import Acquired
 from experiments.build import build_problem
 from experiments.build_trainer import train_aside
 from experiments.progress import track
@@ -45,12 +45,12 @@ def test_one_colour_for_all_pixels_is_what_a_field_must_beat():
     used = np.array([True, False, True, False])
     colours = np.concatenate([scene.pixels[scene.view_slice(v)] for v in (0, 2)]) / 255.0
     expected = np.square(colours - colours.mean(0)).mean()
-    np.testing.assert_allclose(colour_spread(table, used), expected, rtol=1e-6)
+    np.testing.assert_allclose(single_colour_error(table, used), expected, rtol=1e-6)
     mask = np.zeros(len(scene.pixels), bool)
     mask[:5] = True
     masked = table.replace(pixel_mask=jnp.asarray(mask))
     expected = (scene.pixels[:5] / 255.0).var(axis=0).mean()
-    np.testing.assert_allclose(colour_spread(masked, used), expected, rtol=1e-6)
+    np.testing.assert_allclose(single_colour_error(masked, used), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -184,11 +184,9 @@ def test_a_field_trained_aside_begins_anew_and_says_so(capsys):
     scene = toy_scene(num_views=4, num_test=1)
     init, call, inits, keys = make_calls([9.0, 1.0, 0.001])  # the first `init` is no restart
     is_training = np.array([True, True, False, False, False])
-    situation = Situation(fresh(0), make_pixel_table(scene), is_training, 0, label="toy")
+    acquired = Acquired(fresh(0), make_pixel_table(scene), is_training, 0, label="toy")
     trainer = Trainer(init, call, *LONG_CALLS)
-    state = train_aside(
-        toy_config(**LONG), trainer, jax.random.key(0), situation, "variance", track
-    )
+    state = train_aside(toy_config(**LONG), trainer, jax.random.key(0), acquired, "variance", track)
     assert int(state.model.params) == 2 and int(state.step) == 8 and len(keys) == 2 + 8
     assert len({tuple(key) for key in keys}) == 10 and len(inits) == 2
     assert "toy: the variance field is stuck: trained anew with another key (1)" in (

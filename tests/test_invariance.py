@@ -23,7 +23,7 @@ from bavs_jax.selection.policies import POLICIES
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.images import make_image_fn
 from bavs_jax.uncertainty.measures import make_true_error_fn
-from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE, Situation
+from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE, Acquired
 from bavs_jax.uncertainty.models import MODELS
 from bavs_jax.uncertainty.streaming import CurvatureOfRays
 from experiments.build import build_problem
@@ -71,9 +71,9 @@ def toy_fields(similarity):
     return fields, FlowField(apply=drawn, **common)
 
 
-def toy_train(kind, key, situation):
+def toy_train(kind, key, acquired):
     """A field of any kind, another one for each key."""
-    del kind, situation
+    del kind, acquired
     phase = 0.3 * jax.random.normal(key)
     params = {"field": {"phase": phase}, "sampler": {}}
     return TrainState(jnp.int32(0), ModelState(params, {}), params, None)
@@ -110,20 +110,20 @@ class World:
     def __init__(self, name, unbounded):
         similarity = SIMILARITIES[name]
         self.scene = scene = moved_scene(similarity, unbounded)
-        toolbox = build_problem(toy_config(), scene, track=silent).toolbox
+        setup = build_problem(toy_config(), scene, track=silent).setup
         sampler = even_sampler(near=scene.near, far=scene.far, num=32)
         fields, flow = toy_fields(similarity)
         models = {
-            kind: dataclasses.replace(toolbox.models[kind], field=field, sampler=sampler)
+            kind: dataclasses.replace(setup.models[kind], field=field, sampler=sampler)
             for kind, field in fields.items()
         }
         curvature = CurvatureOfRays(
             models[RECONSTRUCTION],
-            toolbox.grid,
-            group_size=toolbox.curvature.group_size,
+            setup.grid,
+            group_size=setup.curvature.group_size,
             track=silent,
         )
-        self.toolbox = toolbox = toolbox._replace(
+        self.setup = setup = setup._replace(
             models=models,
             flow=flow,
             curvature=curvature,
@@ -131,10 +131,10 @@ class World:
             image_scale=1.0,
             chunk=256,
         )
-        render = make_image_fn(toolbox, RECONSTRUCTION)
+        render = make_image_fn(setup, RECONSTRUCTION)
         self.inputs = InputMaker(
-            toolbox,
-            functools.cache(lambda name: MODELS[name].make_fns(toolbox)),
+            setup,
+            functools.cache(lambda name: MODELS[name].make_fns(setup)),
             LookOptions(image_scale=1.0, chunk=256),
             track=silent,
             true_error_fn=make_true_error_fn(
@@ -147,7 +147,7 @@ class World:
         table, train = make_pixel_table(self.scene), toy_train(None, KEY, None)
         is_training = np.isin(np.arange(NUM_VIEWS), INITIAL)
         candidates = dataset_candidates(self.scene).propose(KEY, table, is_training)
-        situation = Situation(train, table, is_training, 64 * len(INITIAL), candidates.cameras)
+        acquired = Acquired(train, table, is_training, 64 * len(INITIAL), candidates.cameras)
         context = make_context(
             candidates.cameras.positions,
             view_ids=candidates.view_ids,
@@ -155,7 +155,7 @@ class World:
             training_positions=table.cameras.positions,
             is_training_view=is_training,
             centre=self.scene.centre,
-            **self.inputs(policy, KEY, situation, candidates).fields,
+            **self.inputs(policy, KEY, acquired, candidates).fields,
         )
         selected, info = acquire(policy, KEY, context, BATCH)
         scores = info.scores[np.isfinite(info.scores)]

@@ -34,7 +34,7 @@ TINY = {
     "proposal__num_samples": 8,
     "proposal__log2_table_size": 10,
     "proposal__num_levels": 1,
-    "field__num_levels": 1,
+    "hash_grid__num_levels": 1,
     "train__num_rays": 128,
     "train__num_steps": 160,
     "train__steps_per_call": 16,
@@ -53,7 +53,7 @@ def tiny_problem(unbounded, **overrides):
     [
         pytest.param(False, "nerf_mlp", {}, marks=pytest.mark.slow),
         pytest.param(False, "mip_mlp", {}, marks=pytest.mark.slow),
-        (True, "hash_grid", {"field__appearance_features": 2}),
+        (True, "hash_grid", {"hash_grid__appearance_features": 2}),
     ],
 )
 def test_rounds_run_and_trace_nothing_new(unbounded, field_kind, options):

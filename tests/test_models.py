@@ -10,7 +10,7 @@ from bavs_jax.models.losses import gaussian_nll
 from bavs_jax.pixel_table import view_pixel_rays
 from bavs_jax.policy_inputs import WEIGHTING, make_candidate_curvature_fn, training_looks
 from bavs_jax.uncertainty.measures import make_true_error_fn
-from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
+from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired
 from bavs_jax.uncertainty.models import MODELS, get_model
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from bavs_jax.uncertainty.scoring import mean_uncertainty
@@ -27,13 +27,13 @@ every_model = pytest.mark.parametrize("name", MODELS)
 
 @pytest.fixture(scope="module")
 def trained():
-    """A problem, and the situation after a short training on its initial views."""
+    """A problem, and the acquired after a short training on its initial views."""
     config = toy_config(train__num_steps=64, candidates__image_scale=0.5)
     problem = build_problem(config, load_config_scene(config, cache_dir=None), track=silent)
     initial = initial_views(problem.scene, 0, 4)
     mask = np.zeros(problem.scene.num_views, bool)
     mask[initial] = True
-    situation = Situation(
+    acquired = Acquired(
         train=None,
         table=problem.table,
         is_training_view=jnp.asarray(mask),
@@ -41,15 +41,15 @@ def trained():
         candidates=take(problem.table.cameras, np.asarray(problem.scene.pool)),
         label="toy",
     )
-    train = problem.toolbox.train(RECONSTRUCTION, KEY, situation)
-    return problem, situation._replace(train=train)
+    train = problem.setup.train(RECONSTRUCTION, KEY, acquired)
+    return problem, acquired._replace(train=train)
 
 
 @pytest.fixture(scope="module")
 def fitted_models(trained):
-    problem, situation = trained
+    problem, acquired = trained
     models = {name: problem.model_fns(name) for name in MODELS}
-    return {name: (fns, fns.fit(KEY, situation)) for name, fns in models.items()}
+    return {name: (fns, fns.fit(KEY, acquired)) for name, fns in models.items()}
 
 
 def rays_of_view(problem, view=0):
@@ -60,10 +60,10 @@ def rays_of_view(problem, view=0):
 
 @every_model
 def test_images_are_whole_finite_and_not_negative(trained, fitted_models, name):
-    problem, situation = trained
+    problem, acquired = trained
     fns, fitted = fitted_models[name]
     rays = rays_of_view(problem)
-    images = fns.render(fitted, situation.train, rays)
+    images = fns.render(fitted, acquired.train, rays)
     assert {"rgb", "depth", "opacity", "thinned", "uncertainty"} <= images.keys()
     assert images["rgb"].shape == (len(rays.origins), 3)
     for value in images.values():
@@ -73,65 +73,65 @@ def test_images_are_whole_finite_and_not_negative(trained, fitted_models, name):
 
 @every_model
 def test_a_ray_that_meets_nothing_is_certain(trained, fitted_models, name):
-    problem, situation = trained
+    problem, acquired = trained
     fns, fitted = fitted_models[name]
     rays = rays_of_view(problem)
     away = rays.replace(directions=-rays.directions)  # away from the scene's box
-    images = fns.render(fitted, situation.train, away)
+    images = fns.render(fitted, acquired.train, away)
     np.testing.assert_array_equal(images["opacity"], 0.0)
     for measure in images.keys() - {"rgb"}:
         np.testing.assert_allclose(images[measure], 0.0, atol=1e-7, err_msg=measure)
 
 
 def test_only_coverage_can_be_conditioned_on_picks_and_falls_with_them(trained, fitted_models):
-    problem, situation = trained
+    problem, acquired = trained
     assert [n for n, (fns, _) in fitted_models.items() if fns.condition] == ["coverage"]
     fns, fitted = fitted_models["coverage"]
     num = len(problem.scene.pool)
     picked = np.zeros(num, bool)
-    unseen = int(np.flatnonzero(~np.asarray(situation.is_training_view)[problem.scene.pool])[0])
+    unseen = int(np.flatnonzero(~np.asarray(acquired.is_training_view)[problem.scene.pool])[0])
 
     def score(state):
-        small = reduced_cameras(take(situation.candidates, np.array([unseen])), 0.5)
+        small = reduced_cameras(take(acquired.candidates, np.array([unseen])), 0.5)
         return mean_uncertainty(
-            lambda rays: fns.render(state, situation.train, rays), small, chunk=RENDER_CHUNK
+            lambda rays: fns.render(state, acquired.train, rays), small, chunk=RENDER_CHUNK
         )[0]
 
-    before = score(fns.condition(fitted, situation.train, picked))
+    before = score(fns.condition(fitted, acquired.train, picked))
     picked[unseen] = True
-    after = score(fns.condition(fitted, situation.train, picked))
+    after = score(fns.condition(fitted, acquired.train, picked))
     # A field of so few steps is fog, and in fog a view sees only what is not behind its surface.
     assert 0.0 < after < 0.9 * before
 
 
 def test_candidates_add_what_their_photos_would(trained):
-    problem, situation = trained
-    toolbox = problem.toolbox
-    curvature = make_candidate_curvature_fn(toolbox, situation, situation.candidates, 1.0)
+    problem, acquired = trained
+    setup = problem.setup
+    curvature = make_candidate_curvature_fn(setup, acquired, acquired.candidates, 1.0)
     num_rays = int(problem.scene.offsets[1])
     pixel_ids = np.arange(num_rays, dtype=np.int32)
     for index, added in zip((3, 1), curvature(np.array([3, 1]))):
         views = np.full(num_rays, problem.scene.pool[index], np.int32)
-        rays = view_pixel_rays(situation.table.cameras, views, pixel_ids)
-        jac_sq_sum = toolbox.curvature(situation.train.model, rays, None, weighting=WEIGHTING)
-        expected = 2.0 / situation.num_rays * np.asarray(jac_sq_sum)
+        rays = view_pixel_rays(acquired.table.cameras, views, pixel_ids)
+        jac_sq_sum = setup.curvature(acquired.train.model, rays, None, weighting=WEIGHTING)
+        expected = 2.0 / acquired.num_rays * np.asarray(jac_sq_sum)
         assert expected.max() > 0
         # Sums of float32 in another order of rays.
         np.testing.assert_allclose(added, expected, rtol=1e-4, atol=1e-6 * expected.max())
 
 
 def test_looks_of_the_training_views_add_up_to_their_curvature(trained):
-    problem, situation = trained
-    toolbox = problem.toolbox
-    looks = training_looks(toolbox, situation, 1.0)
-    taken = np.flatnonzero(situation.is_training_view)
-    positions = np.asarray(situation.table.cameras.positions)[taken]
+    problem, acquired = trained
+    setup = problem.setup
+    looks = training_looks(setup, acquired, 1.0)
+    taken = np.flatnonzero(acquired.is_training_view)
+    positions = np.asarray(acquired.table.cameras.positions)[taken]
     np.testing.assert_array_equal([look.position for look in looks], positions)
-    total = np.zeros((toolbox.grid.num_vertices, 3))
+    total = np.zeros((setup.grid.num_vertices, 3))
     for look in looks:
         np.add.at(total, np.asarray(look.rows), np.asarray(look.h))
-    jac_sq_sum = training_curvature(jax.random.key(0), toolbox, situation, WEIGHTING)
-    expected = 2.0 / situation.num_rays * np.asarray(jac_sq_sum)
+    jac_sq_sum = training_curvature(jax.random.key(0), setup, acquired, WEIGHTING)
+    expected = 2.0 / acquired.num_rays * np.asarray(jac_sq_sum)
     # Sums of float32 in another order of rays.
     np.testing.assert_allclose(total, expected, rtol=1e-4, atol=1e-6 * expected.max())
 

@@ -167,7 +167,7 @@ def test_flags_of_every_script_are_taken_or_refused_in_one_line(name, tmp_path):
 BAD_COMMANDS = [
     *(f"active_selection --config.{option}" for option in (
         "policies=()", "policies=(1,)", "policies=('bavz',)", "seeds=()", "seeds=(-1,)",
-        "seeds=(4294967296,)", "image_size=100000", "field.coarsest=0", "field.finest=8",
+        "seeds=(4294967296,)", "image_size=100000", "hash_grid.coarsest=0", "hash_grid.finest=8",
         "march.num_steps=0", "train.steps_per_call=0", "train.num_rays=0", "train.capacity=0",
         "train.capacity=8", "train.num_steps=0", "train.learning_rate=nan",
         "uncertainty.log2_cells=12", "lpips_net=nonsense", "load.seed=-1", "batch_size=-3",

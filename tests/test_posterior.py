@@ -62,7 +62,7 @@ def test_posterior_variant_is_the_spread_of_drawn_offsets():
     theta = jax.random.normal(jax.random.key(6), (draws, *jac.shape)) * jnp.sqrt(variance)
     offsets = jax.vmap(lambda t: displace(GRID, t, POINTS[:5]))(theta)
     want = offsets.var(0).sum(-1)
-    summed = vertex_variance(jac, **kwargs, weighting="eq13", variant="posterior")
+    summed = vertex_variance(jac, **kwargs, weighting="gauss_newton", variant="posterior")
     got = jnp.square(uncertainty_at(GRID, summed, POINTS[:5], variant="posterior"))
     # The relative standard error of a variance is sqrt(2 / draws) = 2.2 %; four of them.
     np.testing.assert_allclose(got, want, rtol=0.09)
@@ -74,7 +74,7 @@ def test_bayesrays_variant_interpolates_a_constant_exactly():
     np.testing.assert_allclose(got, 2.0, rtol=1e-5)
     jac = jnp.full((GRID.num_vertices, 3), 2.0)
     vertex = vertex_variance(
-        jac, num_rays=3, prior_weight=0.5, weighting="eq13", variant="bayesrays"
+        jac, num_rays=3, prior_weight=0.5, weighting="gauss_newton", variant="bayesrays"
     )
     np.testing.assert_allclose(vertex, 1.0 / (6.0 / 3 + 0.5), rtol=1e-6)
 
@@ -131,7 +131,7 @@ def test_the_vertices_in_the_box_are_the_middle_half():
 def test_unknown_variant_and_scale_are_errors():
     with pytest.raises(ValueError, match="use one of posterior, bayesrays"):
         vertex_variance(
-            jnp.ones((8, 3)), num_rays=1, prior_weight=1.0, weighting="eq13", variant="x"
+            jnp.ones((8, 3)), num_rays=1, prior_weight=1.0, weighting="gauss_newton", variant="x"
         )
     with pytest.raises(ValueError, match="use one of log, sigma"):
         make_uncertainty_channel(GRID, jnp.ones(8), variant="posterior", scale="x")

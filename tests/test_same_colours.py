@@ -137,7 +137,7 @@ def test_the_residual_of_the_curvature_is_that_of_the_render(unbounded, codes):
             inputs=model.field.inputs(rays, samples, view_ids),
         ).rgb
 
-    curvature = make_curvature_fn(model, grid, weighting="eq11")
+    curvature = make_curvature_fn(model, grid, weighting="residual_weighted")
     rgb = np.asarray(rendered())
     right, wrong = (
         curvature(state, rays, targets=targets, view_ids=view_ids) for targets in (rgb, rgb + 0.01)

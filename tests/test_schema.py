@@ -33,7 +33,7 @@ BAD = (
 ZERO_IS_FINE = {
     *("image_size", "load.downscale", "load.pool_size", "load.test_every", "load.seed"),
     *("num_initial", "num_rounds", "num_test", "num_test_final", "num_pictures"),
-    *("checkpoint_seconds", "field.appearance_features", "nerf_mlp.skip", "mip_mlp.skip"),
+    *("checkpoint_seconds", "hash_grid.appearance_features", "nerf_mlp.skip", "mip_mlp.skip"),
     *("flow_training.entropy_weight", "proposal.anneal_steps", "proposal.interlevel_weight"),
     *("proposal.distortion_weight", "proposal.penalty_weight", "train.learning_rate"),
     *("train.warmup_steps", "train.max_grad_norm", "train.adam_b2", "train.penalty_weight"),
@@ -136,7 +136,7 @@ def test_an_option_that_is_a_group_or_missing_or_unknown_is_named():
         ("policies", ("bavz",), "'bavs'"),
         ("seeds", (2**32,), "0 to 4,294,967,295"),
         ("load.pool_size", 1.5, "a whole count"),
-        ("field.finest", 8, "is 8; give at least field.coarsest, 16"),
+        ("hash_grid.finest", 8, "is 8; give at least field.coarsest, 16"),
         ("proposal.finest", (8, 64), "give at least proposal.coarsest, 16"),
         ("candidates.min_train_distance", 0.5, "give both min_train_distance and"),
     ],

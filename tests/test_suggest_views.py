@@ -239,7 +239,8 @@ def test_csv_parses_back(written):
 # --- the script ---
 
 SMALL = {
-    "field.num_levels": 2, "field.finest": 32, "field.width": 16, "field.direction_degree": 1,
+    "hash_grid.num_levels": 2, "hash_grid.finest": 32, "hash_grid.width": 16,
+    "hash_grid.direction_degree": 1,
     "march.num_steps": 32, "march.num_slots": 16, "march.occupancy_resolution": 16,
     "train.steps_per_call": 4, "train.num_rays": 64, "train.capacity": 1024,
     "uncertainty.log2_cells": 3,
@@ -264,7 +265,7 @@ def finished(tmp_path_factory):
     data = write_nerfstudio(base / "capture", width=48, height=32, fl_x=60.0, fl_y=62.0)
     flags = [f"--data={data}", f"--workdir={base / 'out'}", "--image_size=24", "--train_steps=16"]
     flags += ["--num_views=3", "--num_candidates=12", "--score_scale=0.5"]
-    flags += ["--config.field.num_levels=2", "--config.proposal.num_levels=1"]
+    flags += ["--config.hash_grid.num_levels=2", "--config.proposal.num_levels=1"]
     done = script(*flags, "--route", "--start=4,0,1", "--holdout=2")
     assert done.returncode == 0, done.stderr
     return base, flags, done.stdout

@@ -151,7 +151,7 @@ def test_axes_are_read_by_the_type_of_their_option():
         "config.uncertainty.log2_cells=5:8",
         "config.candidates.image_scale=0.25,1",
         "config.proposal.finest=(64,128),(32,64)",
-        "config.uncertainty.weighting=eq13,eq11",
+        "config.uncertainty.weighting=gauss_newton,residual_weighted",
         "config.from_scratch=True,False",
     ]
     axes = parse_axes(texts, config)
@@ -160,7 +160,7 @@ def test_axes_are_read_by_the_type_of_their_option():
         "uncertainty.log2_cells": (5, 6, 7),
         "candidates.image_scale": (0.25, 1.0),
         "proposal.finest": ((64, 128), (32, 64)),
-        "uncertainty.weighting": ("eq13", "eq11"),
+        "uncertainty.weighting": ("gauss_newton", "residual_weighted"),
         "from_scratch": (True, False),
     }
     assert axes.options == tuple(tuple({k: v} for v in vs) for k, vs in expected.items())

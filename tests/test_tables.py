@@ -210,7 +210,11 @@ def test_settings_are_compared_seed_by_seed(tmp_path):
 
 
 def test_settings_that_set_different_options_go_by_their_names(tmp_path):
-    changes = {"unchanged": {}, "L=5": {"L": 5}, "weighting=eq11": {"weighting": "eq11"}}
+    changes = {
+        "unchanged": {},
+        "L=5": {"L": 5},
+        "weighting=a": {"weighting": "a"},
+    }
     rows = [
         {"folder": name, "values": values, "policies": ["bavs"], "seeds": [0, 1]}
         for name, values in changes.items()

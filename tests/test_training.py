@@ -469,7 +469,7 @@ def test_streamed_curvature_equals_one_dense_call_for_any_bucket(trainer):
     state = ModelState(params, occupancy)
     grid = DeformationGrid(jnp.asarray(scene.box), 3)
     view_ids, pixel_ids = training_pixels(table, np.arange(scene.num_views) < 2)
-    pixels = table_rays(table, view_ids, pixel_ids, "eq13")
+    pixels = table_rays(table, view_ids, pixel_ids, "gauss_newton")
     rays = view_pixel_rays(table.cameras, jnp.asarray(view_ids), jnp.asarray(pixel_ids))
 
     @jax.jit

@@ -14,10 +14,10 @@ from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.rendering.compositing import composite_colour, render_weights
 from bavs_jax.rendering.histograms import (
     distortion_loss,
-    even_places,
     interlevel_loss,
     overlapping_weight,
     sample_histogram,
+    stratified_quantiles,
 )
 from bavs_jax.rendering.proposals import anneal_exponent, make_proposal_sampler
 from bavs_jax.rendering.render import render_rays
@@ -113,7 +113,7 @@ def histograms(num_rays=7, num=12, seed=0):
 
 def test_inverse_cdf_agrees_with_a_walk():
     edges, weights = histograms()
-    places = np.asarray(even_places(jax.random.key(0), 7, 20))
+    places = np.asarray(stratified_quantiles(jax.random.key(0), 7, 20))
     got = sample_histogram(edges, weights, places)
     want = [inverse_cdf_loop(e, w, p) for e, w, p in zip(edges, weights, places)]
     np.testing.assert_allclose(got, want, atol=1e-5)  # float32 sums of twelve, over thin intervals
@@ -123,14 +123,14 @@ def test_inverse_cdf_agrees_with_a_walk():
 def test_samples_of_a_histogram_fall_into_intervals_by_their_weight():
     edges = jnp.array([[0.0, 0.2, 0.7, 1.0]])
     weights = jnp.array([[1.0, 0.0, 3.0]])
-    got = sample_histogram(edges, weights, even_places(None, 1, 1000))
+    got = sample_histogram(edges, weights, stratified_quantiles(None, 1, 1000))
     counts = np.histogram(got[0], np.array([0.0, 0.2, 0.7, 1.0 + 1e-6]))[0]
     np.testing.assert_allclose(counts, [250, 0, 750], atol=1)
 
 
 def test_places_are_even_and_jittered_as_one():
-    np.testing.assert_allclose(even_places(None, 2, 4), [[0.125, 0.375, 0.625, 0.875]] * 2)
-    jittered = even_places(jax.random.key(0), 100, 4)
+    np.testing.assert_allclose(stratified_quantiles(None, 2, 4), [[0.125, 0.375, 0.625, 0.875]] * 2)
+    jittered = stratified_quantiles(jax.random.key(0), 100, 4)
     np.testing.assert_allclose(np.diff(jittered), 0.25, atol=1e-6)
     assert jittered.min() >= 0 and jittered.max() < 1 and jittered[:, 0].std() > 0.05
 
@@ -188,7 +188,7 @@ def test_gradients_are_finite_at_extreme_weights(scale):
 
     assert np.isfinite(jax.grad(loss)(scale * weights)).all()
     assert np.isfinite(
-        sample_histogram(edges, scale * weights + 0.01, even_places(None, 7, 6))
+        sample_histogram(edges, scale * weights + 0.01, stratified_quantiles(None, 7, 6))
     ).all()
 
 

@@ -7,7 +7,7 @@ import types
 import numpy as np
 import pytest
 
-from bavs_jax.uncertainty.model import Situation
+from bavs_jax.uncertainty.model import Acquired
 from experiments.reporting.uncertainty_tables import load_result
 from experiments.uncertain import measure
 from experiments.uncertain.measure import row_path, write_summary
@@ -47,9 +47,9 @@ def place(tmp_path, monkeypatch):
 
     def trained(config, problem, folder, seed, command):
         log.append(f"train {seed}")
-        return Situation({}, None, is_training_view, 288, label=f"seed {seed}")
+        return Acquired({}, None, is_training_view, 288, label=f"seed {seed}")
 
-    def fit(problem, name, key, situation):
+    def fit(problem, name, key, acquired):
         log.append(f"fit {name}")
         return measure.FittedModel(make_render(name), 0.5)
 
@@ -59,7 +59,7 @@ def place(tmp_path, monkeypatch):
         log.append(f"render {label.split()[-1]}")
         return render_model(scene, fitted, view_ids, label)
 
-    monkeypatch.setattr(measure, "trained_situation", trained)
+    monkeypatch.setattr(measure, "trained_views", trained)
     monkeypatch.setattr(measure, "fit_model", fit)
     monkeypatch.setattr(measure, "render_model", render)
     return toy_config(**CONFIG), types.SimpleNamespace(scene=scene), tmp_path, log
@@ -69,10 +69,10 @@ def test_each_step_is_done_once_wherever_it_is_killed(place, monkeypatch):
     config, problem, folder, log = place
     whole_fit = measure.fit_model
 
-    def killed_fit(problem, name, key, situation):
+    def killed_fit(problem, name, key, acquired):
         if name == "ensemble":
             raise KeyboardInterrupt
-        return whole_fit(problem, name, key, situation)
+        return whole_fit(problem, name, key, acquired)
 
     monkeypatch.setattr(measure, "fit_model", killed_fit)
     with pytest.raises(KeyboardInterrupt):

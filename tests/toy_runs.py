@@ -18,10 +18,10 @@ OVERRIDES = {
     "lpips_net": "",
     "checkpoint_seconds": 0.0,
     "rays_per_pixel": 1,
-    "field.num_levels": 2,
-    "field.finest": 32,
-    "field.width": 16,
-    "field.initial_optical_depth": 2.0,  # learns in a few steps
+    "hash_grid.num_levels": 2,
+    "hash_grid.finest": 32,
+    "hash_grid.width": 16,
+    "hash_grid.initial_optical_depth": 2.0,  # learns in a few steps
     "march.num_steps": 48,
     "march.num_slots": 32,
     "march.occupancy_resolution": 16,

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from bavs_jax.numerics import computed_once
+from bavs_jax.numerics import materialize
 
 # The hash primes of Mueller et al. 2022 (Eq 4); the first factor is 1 for cache coherence.
 _PRIME_Y = np.uint32(2654435761)
@@ -108,7 +108,7 @@ class HashEncoding(nn.Module):
     @nn.compact
     def __call__(self, unit_positions: jax.Array) -> jax.Array:
         levels = []
-        unit_positions = computed_once(unit_positions)
+        unit_positions = materialize(unit_positions)
         for level, resolution in enumerate(self.resolutions):
             rows = min((resolution + 1) ** 3, 2**self.log2_table_size)
             table = self.param(

@@ -54,7 +54,7 @@ def _render_batch(
             inputs=field.inputs(batch.rays, samples, batch.view_ids),
         )
 
-    return over_rays(render, mesh, spread=(False, True, True))
+    return over_rays(render, mesh, sharded=(False, True, True))
 
 
 def make_colour_objective(field: Field, *, capacity: int, mesh: Mesh | None = None) -> Objective:
@@ -145,7 +145,7 @@ def make_flow_objective(
             exact=False,
         )
 
-    render_draw = over_rays(render, mesh, spread=(False, False, True, True))
+    render_draw = over_rays(render, mesh, sharded=(False, False, True, True))
     render_draws = jax.vmap(render_draw, in_axes=(None, 0, None, None))
 
     def objective(key, params, batch, samples):

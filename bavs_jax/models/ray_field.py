@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 
 from bavs_jax.arrays import Array
 from bavs_jax.cameras import Rays
-from bavs_jax.devices import over_rays, spread_rays
+from bavs_jax.devices import over_rays, shard_rays
 from bavs_jax.fields.base import Field
 from bavs_jax.models.base import ModelState, RayTerms, StepReport
 from bavs_jax.models.losses import colour_loss
@@ -93,7 +93,7 @@ class RayField:
             background=self.background,
             random_background=training.random_background,
         )
-        batch = spread_rays(batch, self.mesh)
+        batch = shard_rays(batch, self.mesh)
         samples, aux = self.sampler.sample(sample_key, params["sampler"], state.carried, batch.rays)
         fits = jnp.ones(training.num_rays, bool)
         if training.capacity_before_hiding and not self.sampler.dense:
@@ -137,7 +137,7 @@ class RayField:
             )
 
         spread = (False, True, True)
-        return over_rays(visible, self.mesh, spread=spread)(field_params, rays, samples)
+        return over_rays(visible, self.mesh, sharded=spread)(field_params, rays, samples)
 
     def refresh(self, key, state: ModelState, step) -> ModelState:
         density_fn = partial(self.field.density, state.params["field"])

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from bavs_jax.fields.base import Field
 from bavs_jax.rendering.compositing import composite_colour, render_weights
-from bavs_jax.rendering.histograms import even_places, sample_histogram
+from bavs_jax.rendering.histograms import sample_histogram, stratified_quantiles
 from bavs_jax.rendering.samplers import Sampler, dense_samples
 from bavs_jax.rendering.sampling import flatten_inputs, sample_positions
 from bavs_jax.rendering.spacing import IntervalFn
@@ -42,7 +42,9 @@ def make_coarse_to_fine_sampler(
         weights, rgb = _render_coarse(coarse, params, rays, samples, background)
 
         padded = jax.lax.stop_gradient(weights) + PADDING
-        s_fine = sample_histogram(s_edges, padded, even_places(keys[1], num_rays, num_fine))
+        s_fine = sample_histogram(
+            s_edges, padded, stratified_quantiles(keys[1], num_rays, num_fine)
+        )
         s_all = jnp.sort(jnp.concatenate([s_coarse, s_fine], axis=-1), axis=-1)
         # Each sample stands for the way up to the middles between it and its neighbours.
         ends = jnp.ones((num_rays, 1))

@@ -12,7 +12,7 @@ PADDING = 0.01  # weight that each interval gets on top, so that none is never l
 TINY = 1e-7  # of a weight; keeps the division in the interlevel loss finite
 
 
-def even_places(key: jax.Array | None, num_rays: int, num: int) -> jax.Array:
+def stratified_quantiles(key: jax.Array | None, num_rays: int, num: int) -> jax.Array:
     """`(i + jitter) / num` for i = 0 .. num - 1, [R, num] in [0, 1).
 
     One jitter a ray keeps the places evenly spaced; it is 1/2 where `key` is None.

@@ -10,9 +10,9 @@ from bavs_jax.fields.base import DensityField
 from bavs_jax.rendering.histograms import (
     PADDING,
     distortion_loss,
-    even_places,
     interlevel_loss,
     sample_histogram,
+    stratified_quantiles,
 )
 from bavs_jax.rendering.samplers import Sampler, dense_samples, field_weights
 from bavs_jax.rendering.spacing import IntervalFn
@@ -123,6 +123,6 @@ def _even_edges(key, num_rays: int, count: int) -> jax.Array:
     Differs from nerfacto, which leaves half an interval out at both ends: what is next to the
     camera, and what is far behind a surface, would never be looked at.
     """
-    inner = even_places(key, num_rays, count)[:, 1:] - 0.5 / count
+    inner = stratified_quantiles(key, num_rays, count)[:, 1:] - 0.5 / count
     ends = jnp.ones((num_rays, 1))
     return jnp.concatenate([0.0 * ends, inner, ends], axis=-1)

@@ -2,7 +2,7 @@
 
 With the posterior precision H [G, 3] of the deformation offsets and the curvature h [G, 3] that a
 view would add to it, the new posterior has the precision `H + h`. A view is rendered for this, not
-photographed: Gauss-Newton curvature (`curvature.WEIGHTINGS`: "eq13") needs its pose alone.
+photographed: Gauss-Newton curvature (`curvature.WEIGHTINGS`: "gauss_newton") needs its pose alone.
 """
 
 from collections.abc import Callable, Iterable

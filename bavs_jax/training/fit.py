@@ -22,7 +22,7 @@ def check_call(num_calls: int, steps_per_call: int) -> int | None:
     return call if 2 * call <= num_calls else None
 
 
-def colour_spread(table: PixelTable, is_training_view) -> float:
+def single_colour_error(table: PixelTable, is_training_view) -> float:
     """Mean squared error of the best single colour for all training pixels, over channels."""
     view_ids, pixel_ids = training_pixels(table, is_training_view)
     rows = np.asarray(table.offsets)[view_ids] + pixel_ids
@@ -90,7 +90,7 @@ def fit(
             )
         calls += 1
         looked_at = calls == trainer.check_call and restarts < MAX_RESTARTS
-        if looked_at and is_stuck(info, colour_spread(table, is_training_view)):
+        if looked_at and is_stuck(info, single_colour_error(table, is_training_view)):
             restarts += 1
             train, calls = trainer.init(_call_key(key, restarts, trainer.num_calls)), 0
         yield Fitted(train, calls, restarts, info)

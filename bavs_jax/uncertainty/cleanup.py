@@ -100,7 +100,7 @@ def make_cleaned_render_fn(
     return render
 
 
-def spread_thresholds(variance, num: int, unit) -> np.ndarray:
+def even_thresholds(variance, num: int, unit) -> np.ndarray:
     """Thresholds [num + 1] from the most certain vertex to the least certain one, then `+inf`.
 
     Args:

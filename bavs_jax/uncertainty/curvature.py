@@ -19,22 +19,23 @@ from bavs_jax.fields.deformation import (
     vertex_number,
 )
 from bavs_jax.models.base import RayTerms
-from bavs_jax.numerics import computed_once
+from bavs_jax.numerics import materialize
 from bavs_jax.registry import check_known
 
-WEIGHTINGS = ("eq13", "eq11", "empirical")
+WEIGHTINGS = ("gauss_newton", "residual_weighted", "empirical_fisher")
 
 
 def weight_jacobian(jacobian: jax.Array, residual: jax.Array | None, weighting: str) -> jax.Array:
     """Folds a weighting into the Jacobian so that all of them end as a plain sum of squares.
 
-    - `eq13`: unchanged; sum over channels of g^2.
-    - `eq11`: times `sqrt(eps)`, `eps = |e|^2` (Eq 12); sum of `eps g^2`.
-    - `empirical`: `sum_c e_c g_c` as a single channel; its square is the exact empirical Fisher.
+    - `gauss_newton` (Eq 13): unchanged; sum over channels of g^2.
+    - `residual_weighted` (Eq 11): times `sqrt(eps)`, `eps = |e|^2` (Eq 12); sum of `eps g^2`.
+    - `empirical_fisher`: `sum_c e_c g_c` as a single channel; its square is the exact empirical
+      Fisher.
 
     Args:
       jacobian: [R, 3, S, 3].
-      residual: e = C - C* [R, 3]; None for `eq13` only.
+      residual: e = C - C* [R, 3]; None for `gauss_newton` only.
       weighting: one of `WEIGHTINGS`.
 
     Returns:
@@ -44,11 +45,11 @@ def weight_jacobian(jacobian: jax.Array, residual: jax.Array | None, weighting: 
       ValueError: unknown weighting, or a residual is needed and missing.
     """
     check_known("weighting", weighting, WEIGHTINGS)
-    if weighting == "eq13":
+    if weighting == "gauss_newton":
         return jacobian
     if residual is None:
         raise ValueError(f"weighting {weighting!r} needs the colour residual of each ray")
-    if weighting == "eq11":
+    if weighting == "residual_weighted":
         return jacobian * jnp.linalg.norm(residual, axis=-1)[:, None, None, None]
     return jnp.einsum("rc,rcsd->rsd", residual, jacobian)[:, None]
 
@@ -86,7 +87,7 @@ def add_jac_sq_sum(
     target: jax.Array | None = None,
     ray_weight: jax.Array | None = None,
     first_row: jax.Array | None = None,
-    weighting: str = "eq13",
+    weighting: str = "gauss_newton",
 ) -> jax.Array:
     """Adds R rays to the raw sum of squared Jacobians (Eqs 11-13).
 
@@ -94,14 +95,14 @@ def add_jac_sq_sum(
       jac_sq_sum: [G, 3] the sum so far; or several of them, one after another, [N G, 3].
       terms: of the R rays, from `RadianceModel.ray_terms`.
       grid: the deformation grid of G vertices.
-      target: [R, 3] true colours; needed by `eq11` and `empirical`.
+      target: [R, 3] true colours; needed by `residual_weighted` and `empirical_fisher`.
       ray_weight: [R] factor of each ray's contribution, 0 for padding; 1 when None.
       first_row: [R] int, a multiple of G: where the sum of each ray begins; 0 when None.
       weighting: one of `WEIGHTINGS`.
     """
     residual = None if target is None else terms.rgb - target
     jacobian = weight_jacobian(terms.colour_jacobian, residual, weighting)
-    positions = computed_once(terms.positions)
+    positions = materialize(terms.positions)
     rows, added = jax.vmap(vertex_squares, in_axes=(None, 0, 0))(grid, positions, jacobian)
     if ray_weight is not None:
         added = added * ray_weight[:, None, None, None]

@@ -69,7 +69,7 @@ def make_displaced_render_fn(
     return render
 
 
-def colour_spread(rgb: jax.Array) -> jax.Array:
+def colour_deviation(rgb: jax.Array) -> jax.Array:
     """How far a pixel's colour moves over draws: `sqrt(mean_c var_d C_dc)`, [...] in [0, 1].
 
     The variance is the unbiased one.

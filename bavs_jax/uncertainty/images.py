@@ -11,21 +11,21 @@ from bavs_jax.devices import jit_over_rays
 from bavs_jax.rendering.images import RenderChunk, render_views
 from bavs_jax.rendering.render import RayRendering, basic_images
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.model import Toolbox
+from bavs_jax.uncertainty.model import SceneSetup
 
 
 def make_image_fn(
-    toolbox: Toolbox,
+    setup: SceneSetup,
     kind: str,
     measures_fn: Callable[[RayRendering], dict[str, jax.Array]] | None = None,
 ) -> Callable[[TrainState, Rays], dict[str, jax.Array]]:
     """Makes the compiled renders of a kind of field, `basic_images` and further measures.
 
     Args:
-      kind: a key of `toolbox.models`.
+      kind: a key of `setup.models`.
       measures_fn: the further measures, [R] each; they need a field that is sampled along rays.
     """
-    model = toolbox.models[kind]
+    model = setup.models[kind]
 
     def images(state, rays):
         rendering = model.render(state, rays)
@@ -36,7 +36,7 @@ def make_image_fn(
             raise TypeError(f"{kind}: has no samples along its rays, which the measures are of")
         return {**images, **measures_fn(rendering)}
 
-    compiled = jit_over_rays(images, toolbox.mesh, spread=(False, True))
+    compiled = jit_over_rays(images, setup.mesh, sharded=(False, True))
     return lambda train, rays: compiled(train.model, rays)
 
 

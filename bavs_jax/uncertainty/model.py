@@ -28,7 +28,7 @@ FLOW = "flow"  # the mean of a distribution over fields
 class MakeFns(Protocol):
     """Makes a model for one scene; called once for each, it compiles what it needs."""
 
-    def __call__(self, toolbox: Toolbox, /) -> ModelFns: ...
+    def __call__(self, setup: SceneSetup, /) -> ModelFns: ...
 
 
 class UncertaintyModel(NamedTuple):
@@ -47,7 +47,7 @@ class UncertaintyModel(NamedTuple):
 class Fit(Protocol):
     """All that must be computed before the first pixel, from what is known."""
 
-    def __call__(self, key: jax.Array, situation: Situation, /) -> Fitted: ...
+    def __call__(self, key: jax.Array, acquired: Acquired, /) -> Fitted: ...
 
 
 class RenderFitted(Protocol):
@@ -75,7 +75,7 @@ class LaplaceOptions(NamedTuple):
     """The options of the posterior (see `posterior.py` and `channel.py`)."""
 
     prior_weight: float  # lambda, 1 / scene unit^2
-    weighting: str = "eq13"
+    weighting: str = "gauss_newton"
     variant: str = "posterior"
     scale: str = "log"
     extent: str = "box"
@@ -83,7 +83,7 @@ class LaplaceOptions(NamedTuple):
     offset_cells: float = 0.3  # offsets a priori, standard deviation in cells (`offset_variance`)
 
 
-class Toolbox(NamedTuple):
+class SceneSetup(NamedTuple):
     """What an uncertainty model may use for one scene."""
 
     models: dict[str, RadianceModel]  # by kind
@@ -92,8 +92,8 @@ class Toolbox(NamedTuple):
     grid: DeformationGrid
     laplace: LaplaceOptions
     curvature: CurvatureOfRays  # of the model of this kind
-    # Trains a field of any kind, from a start of its own, on the views of a situation.
-    train: Callable[[str, jax.Array, Situation], TrainState]
+    # Trains a field of any kind, from a start of its own, on the views of a acquired.
+    train: Callable[[str, jax.Array, Acquired], TrainState]
     image_scale: float = 0.25  # of width and height, for renders of whole views
     chunk: int = 4096  # rays of one compiled call
     ensemble_size: int = 3  # fields, the run's own among them
@@ -106,7 +106,7 @@ class Toolbox(NamedTuple):
         return self.models[self.kind]
 
 
-class Situation(NamedTuple):
+class Acquired(NamedTuple):
     """What is known when views are to be chosen."""
 
     train: TrainState

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 NOISE_VARIANCE = 1e-3  # squared colour error per channel that a field leaves on its photos: 30 dB
 
 # Curvature of the mean loss per unit of the raw sum: H = (factor / R) jac_sq_sum + 2 lambda.
-_FACTORS = {"eq13": 2.0, "eq11": 4.0, "empirical": 4.0}
+_FACTORS = {"gauss_newton": 2.0, "residual_weighted": 4.0, "empirical_fisher": 4.0}
 
 
 def default_prior_weight(log2_cells: int) -> float:
@@ -17,7 +17,7 @@ def default_prior_weight(log2_cells: int) -> float:
     return 1e-4 / (2**log2_cells) ** 3
 
 
-def curvature_factor(num_rays, weighting: str = "eq13"):
+def curvature_factor(num_rays, weighting: str = "gauss_newton"):
     """`f / R`, by which the raw sum over rays enters the precision (Eq 13)."""
     return _FACTORS[weighting] / num_rays
 
@@ -28,11 +28,12 @@ def prior_precision(prior_weight):
 
 
 def posterior_precision(
-    jac_sq_sum: jax.Array, *, num_rays, prior_weight, weighting: str = "eq13"
+    jac_sq_sum: jax.Array, *, num_rays, prior_weight, weighting: str = "gauss_newton"
 ) -> jax.Array:
     """Curvature of the negative log posterior, `H = (f / R) jac_sq_sum + 2 lambda` (Eq 13).
 
-    H is in 1 / scene unit^2; `f` is 2 for `eq13` and 4 for `eq11` and `empirical`.
+    H is in 1 / scene unit^2; `f` is 2 for `gauss_newton` and 4 for the other two
+    weightings.
 
     Args:
       jac_sq_sum: [G, 3] raw sum over rays, >= 0.
@@ -65,7 +66,7 @@ def offset_variance(
     many scene sizes, where nothing is linear any more.
 
     Args:
-      jac_sq_sum: [G, 3] raw sum over the training rays, weighting `eq13`.
+      jac_sq_sum: [G, 3] raw sum over the training rays, weighting `gauss_newton`.
       offset_std: `std`, [3] or a number > 0, scene units.
       noise_variance: s^2 > 0, per colour channel.
     """

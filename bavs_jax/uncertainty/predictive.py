@@ -23,7 +23,7 @@ from bavs_jax.cameras import Rays
 from bavs_jax.devices import jit_over_rays, num_shards
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.models.base import ModelState, RadianceModel
-from bavs_jax.numerics import computed_once
+from bavs_jax.numerics import materialize
 from bavs_jax.uncertainty.curvature import vertex_squares
 from bavs_jax.uncertainty.streaming import bucket_sizes, bucketed_rows
 
@@ -75,7 +75,7 @@ def make_predictive_fn(
 
     def render_bucket(state, variance, rays, *, bucket):
         terms = model.ray_terms(state, rays, most_points=bucket, view_ids=None)
-        positions = computed_once(terms.positions)
+        positions = materialize(terms.positions)
         deviation = [
             jnp.sqrt(predictive_variance(grid, positions, jacobian, variance) / jacobian.shape[1])
             for jacobian in (terms.colour_jacobian, terms.depth_jacobian)
@@ -92,10 +92,10 @@ def make_predictive_fn(
     def count_points(state, rays):
         return model.num_points(state, rays)
 
-    count_fn = jit_over_rays(count_points, mesh, spread=(False, True))
+    count_fn = jit_over_rays(count_points, mesh, sharded=(False, True))
     bucket_fns = {
         bucket: jit_over_rays(
-            partial(render_bucket, bucket=bucket), mesh, spread=(False, False, True)
+            partial(render_bucket, bucket=bucket), mesh, sharded=(False, False, True)
         )
         for bucket in buckets
     }

@@ -47,7 +47,7 @@ def make_render_chunk_fn(
             images[name] = finish_uncertainty(value, scale=scale)
         return images
 
-    return jit_over_rays(render_chunk, mesh, spread=(False, False, True))
+    return jit_over_rays(render_chunk, mesh, sharded=(False, False, True))
 
 
 def mean_uncertainty(

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 
 from bavs_jax.arrays import Array
 from bavs_jax.cameras import Cameras, Rays
-from bavs_jax.devices import gather_rays, jit_over_rays, num_shards, over_rays, spread_rays
+from bavs_jax.devices import gather_rays, jit_over_rays, num_shards, over_rays, shard_rays
 from bavs_jax.fields.deformation import DeformationGrid
 from bavs_jax.models.base import ModelState, RadianceModel
 from bavs_jax.pixel_table import PixelTable, view_pixel_rays
@@ -27,7 +27,9 @@ MAX_GROUP, MAX_GROUP_BYTES = 8, 2**26
 class RayFacts(TypedDict, total=False):
     """What is known of each of N rays beside the ray itself; what is left out is None."""
 
-    targets: Array | None  # [N, 3] true colours; needed by `eq11` and `empirical`
+    targets: (
+        Array | None
+    )  # [N, 3] true colours; needed by `residual_weighted` and `empirical_fisher`
     # [N] int: views trained on that the rays belong to, which a model may read in a way of their
     # own. None for rays of any other camera, read as when it renders.
     view_ids: Array | None
@@ -63,7 +65,7 @@ def table_rays(table: PixelTable, view_ids, pixel_ids, weighting: str) -> Curvat
       weighting: one of `curvature.WEIGHTINGS`; true colours are read where it needs them.
     """
     targets = None
-    if weighting != "eq13":
+    if weighting != "gauss_newton":
         rows = np.asarray(table.offsets)[view_ids] + pixel_ids
         targets = np.asarray(table.pixels)[rows].astype(np.float32) / np.float32(255.0)
     rays = rays_through_pixels(table.cameras, view_ids, pixel_ids)
@@ -141,7 +143,7 @@ def make_curvature_fn(
     model: RadianceModel,
     grid: DeformationGrid,
     *,
-    weighting: str = "eq13",
+    weighting: str = "gauss_newton",
     buckets: tuple[int, ...] = (8, 16, 32, 64),
     chunk_samples: int = 8192,
     mesh: Mesh | None = None,
@@ -169,7 +171,7 @@ def make_curvature_fn(
     def count_points(state, rays):
         return model.num_points(state, rays)
 
-    count_fn = jit_over_rays(count_points, mesh, spread=(False, True))
+    count_fn = jit_over_rays(count_points, mesh, sharded=(False, True))
 
     def add_part(totals, state, rows, *, bucket):
         terms = model.ray_terms(state, rows.rays, most_points=bucket, view_ids=rows.view_ids)
@@ -187,11 +189,11 @@ def make_curvature_fn(
     @partial(jax.jit, static_argnames="bucket", donate_argnums=0)
     def add_chunk(totals, *args, bucket):
         spread = (True, False, True)
-        return over_rays(partial(add_part, bucket=bucket), mesh, spread=spread)(totals, *args)
+        return over_rays(partial(add_part, bucket=bucket), mesh, sharded=spread)(totals, *args)
 
     @partial(jax.jit, static_argnames="num_groups")
     def fresh_totals(num_groups):
-        return spread_rays(jnp.zeros((shards, num_groups * grid.num_vertices, 3)), mesh)
+        return shard_rays(jnp.zeros((shards, num_groups * grid.num_vertices, 3)), mesh)
 
     @jax.jit
     def add_shards(totals):
@@ -221,7 +223,7 @@ def make_curvature_fn(
         num_rays = len(rays.origins)
         everything = _Rows(
             rays,
-            target=None if weighting == "eq13" else targets,
+            target=None if weighting == "gauss_newton" else targets,
             # So that models which do not read them have one compilation, not two.
             view_ids=view_ids if model.reads_views else None,
             group_ids=np.zeros(num_rays, np.int32) if group_ids is None else group_ids,

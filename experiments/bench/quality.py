@@ -16,7 +16,7 @@ from experiments.bench.subject import SEED
 from experiments.build import build_problem
 from experiments.build_scene import initial_views, load_config_scene
 from experiments.errors import ConfigError, shown
-from experiments.evaluate import evaluate_views, spread_evenly
+from experiments.evaluate import evaluate_views, evenly_spaced
 from experiments.keys import run_key, stream_key
 from experiments.progress import track
 from experiments.runtime import device_name
@@ -56,7 +56,7 @@ def measure_run(config, *, num_views: int, num_test_views: int, every: int, star
     scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     problem = build_problem(config, scene)
     initial = initial_views(scene, SEED, num_views)
-    view_ids = spread_evenly(scene.test, num_test_views)
+    view_ids = evenly_spaced(scene.test, num_test_views)
     steps, key = config.train.steps_per_call, run_key(SEED)
     calls_between = -(-every // steps)
     train = problem.trainer.init(stream_key(SEED, "init"))

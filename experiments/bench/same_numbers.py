@@ -30,7 +30,7 @@ DEVICE_FILE = "check_device.json"
 FIELDS = {
     "hash_grid": ({}, False, RECONSTRUCTION),
     "proposals": ({"sampler_kind": "proposal"}, False, RECONSTRUCTION),
-    "unbounded": ({"field.appearance_features": 2}, True, RECONSTRUCTION),
+    "unbounded": ({"hash_grid.appearance_features": 2}, True, RECONSTRUCTION),
     "nerf_mlp": ({"field_kind": "nerf_mlp"}, False, RECONSTRUCTION),
     "mip_mlp": ({"field_kind": "mip_mlp"}, False, RECONSTRUCTION),
     "learned_variance": ({}, False, VARIANCE),
@@ -41,7 +41,7 @@ SMALL = {
     "lpips_net": "",
     "train.num_rays": 128,
     "train.capacity": 4096,
-    "field.num_levels": 4,
+    "hash_grid.num_levels": 4,
     "march.num_steps": 48,
     "march.num_slots": 16,
     "march.occupancy_resolution": 16,
@@ -88,9 +88,9 @@ def numbers_on(
         state = jax.device_put(trained, device)
 
         view_ids, pixel_ids = training_pixels(table, is_training)
-        toolbox = problem.toolbox
-        weighting = toolbox.laplace.weighting
-        jac_sq_sum = toolbox.curvature(
+        setup = problem.setup
+        weighting = setup.laplace.weighting
+        jac_sq_sum = setup.curvature(
             state.model,
             label=None,
             weighting=weighting,

@@ -111,9 +111,9 @@ def make_rendering_run(subject: Subject, state: TrainState, num_rays: int) -> Ca
 
 def make_curvature_run(subject: Subject, state: TrainState, num_rays: int) -> Callable:
     """Makes `run() -> jac_sq_sum` of so many training pixels."""
-    toolbox, table = subject.problem.toolbox, subject.problem.table
-    pixels, weighting = draw_training_pixels(subject, num_rays), toolbox.laplace.weighting
-    return lambda: toolbox.curvature(
+    setup, table = subject.problem.setup, subject.problem.table
+    pixels, weighting = draw_training_pixels(subject, num_rays), setup.laplace.weighting
+    return lambda: setup.curvature(
         state.model, label=None, weighting=weighting, **table_rays(table, *pixels, weighting)
     )
 

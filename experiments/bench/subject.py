@@ -12,7 +12,7 @@ from bavs_jax.candidates import scene_hemisphere
 from bavs_jax.pixel_table import training_pixels, view_mask
 from bavs_jax.scenes import Scene
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
+from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired
 from experiments.build import Problem, build_problem
 from experiments.build_scene import initial_views
 from experiments.build_trainer import train_aside
@@ -97,12 +97,12 @@ def make_subject(config, scene: Scene, num_views: int) -> Subject:
 
 def train_field(subject: Subject) -> TrainState:
     """The field at the end of its training."""
-    situation = Situation(
+    acquired = Acquired(
         None, subject.problem.table, subject.is_training_view, 0, label=subject.scene.name
     )
     key = run_key(SEED)
     return train_aside(
-        subject.config, subject.problem.trainer, key, situation, RECONSTRUCTION, track
+        subject.config, subject.problem.trainer, key, acquired, RECONSTRUCTION, track
     )
 
 

@@ -44,17 +44,17 @@ def get_config() -> ConfigDict:
     config.rays_per_pixel = 4
 
     # --- field_kind "hash_grid" (fields/hash_grid.py) ---
-    config.field = ConfigDict()
-    config.field.num_levels = 8
-    config.field.coarsest = 16  # cells per side of the coarsest level
-    config.field.finest = 128
-    config.field.features = 2  # per vertex
-    config.field.log2_table_size = 16
-    config.field.width = 64
-    config.field.geometry_features = 15
-    config.field.initial_optical_depth = 0.3  # of a side of the scene box, before training
-    config.field.direction_degree = 2  # spherical-harmonics bands, 1 .. 4
-    config.field.appearance_features = 0  # of a code for each view trained on; 0: none
+    config.hash_grid = ConfigDict()
+    config.hash_grid.num_levels = 8
+    config.hash_grid.coarsest = 16  # cells per side of the coarsest level
+    config.hash_grid.finest = 128
+    config.hash_grid.features = 2  # per vertex
+    config.hash_grid.log2_table_size = 16
+    config.hash_grid.width = 64
+    config.hash_grid.geometry_features = 15
+    config.hash_grid.initial_optical_depth = 0.3  # of a side of the scene box, before training
+    config.hash_grid.direction_degree = 2  # spherical-harmonics bands, 1 .. 4
+    config.hash_grid.appearance_features = 0  # of a code for each view trained on; 0: none
 
     # --- field_kind "nerf_mlp", the paper's own (fields/nerf_mlp.py); 8 x 256 in the paper ---
     config.nerf_mlp = ConfigDict()
@@ -131,7 +131,9 @@ def get_config() -> ConfigDict:
     config.uncertainty = ConfigDict()
     config.uncertainty.log2_cells = 6  # L: a grid of 2^L cells per side
     config.uncertainty.prior_weight = 0.0  # lambda, of thirds of the box; 0: 1e-4 / (2^L)^3
-    config.uncertainty.weighting = "eq13"  # "eq13", "eq11" or "empirical"
+    config.uncertainty.weighting = (
+        "gauss_newton"  # "gauss_newton", "residual_weighted" or "empirical_fisher"
+    )
     config.uncertainty.variant = "posterior"  # "posterior" or "bayesrays"
     config.uncertainty.scale = "log"  # "log": log10(sigma / third of the box) on [0, 1]; "sigma"
     config.uncertainty.extent = "box"  # what counts: the scene "box", or all "space" around it too

@@ -16,8 +16,8 @@ def get_config():
     config.num_initial = 50
     config.num_rounds = 0
     config.rays_per_pixel = 1
-    config.field.finest = 512
-    config.field.appearance_features = 4
+    config.hash_grid.finest = 512
+    config.hash_grid.appearance_features = 4
     config.train.num_rays = 1024  # each with all of its samples
     config.train.num_steps = 4000
     config.uncertainty.max_rays = 100_000

@@ -14,7 +14,7 @@ from bavs_jax.fields.deformation import DeformationGrid, vertex_positions
 from bavs_jax.metrics.covered import MIN_OPACITY
 from bavs_jax.rendering.images import render_views
 from bavs_jax.uncertainty.draws import (
-    colour_spread,
+    colour_deviation,
     draw_offsets,
     make_displaced_render_fn,
     noise_scale,
@@ -37,7 +37,7 @@ class ViewDraws(NamedTuple):
     @property
     def spread(self) -> np.ndarray:
         """Standard deviation of the colour over draws, [H, W]."""
-        return np.asarray(colour_spread(self.draws))
+        return np.asarray(colour_deviation(self.draws))
 
 
 def farthest_view(run: TrainedRun, view_ids) -> int:
@@ -93,7 +93,7 @@ def draw_views(
         ]
         scale = float(noise_scale(np.mean(squares), run.num_rays))
 
-    displaced = make_displaced_render_fn(run.toolbox.model, run.toolbox.grid)
+    displaced = make_displaced_render_fn(run.setup.model, run.setup.grid)
     precision, key = run_precision(run, jac_sq_sum), stream_key(run.seed, "draws")
     by_draw = []
     with track(total * num_draws, f"{run.label}: {num_draws} draws", "rays") as bar:

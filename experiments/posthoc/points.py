@@ -20,8 +20,8 @@ def scene_point_fn(run: TrainedRun, variance: jax.Array) -> Callable:
       run: the run.
       variance: from `run_variance`.
     """
-    toolbox = run.toolbox
-    point_fn = make_point_fn(toolbox.model, toolbox.grid, variant=toolbox.laplace.variant)
+    setup = run.setup
+    point_fn = make_point_fn(setup.model, setup.grid, variant=setup.laplace.variant)
     return partial(point_fn, run.state.train.model, variance)
 
 

@@ -32,13 +32,13 @@ from bavs_jax.selection.worth import Worth, worth_along
 from bavs_jax.training.checkpoints import Checkpoints
 from bavs_jax.training.fit import fit
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.model import RECONSTRUCTION, Situation
+from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
 from bavs_jax.uncertainty.scoring import mean_uncertainty
 from experiments.build import RENDER_CHUNK, Problem
 from experiments.configs import capture
-from experiments.evaluate import evaluate_views, spread_evenly
+from experiments.evaluate import evaluate_views, evenly_spaced
 from experiments.files import read_arrays, write_arrays
 from experiments.keys import run_key, stream_key
 from experiments.progress import track
@@ -74,7 +74,7 @@ def all_for_training(scene: Scene, holdout: int) -> Scene:
             f"{scene.name}: --holdout={holdout} of {scene.num_views} photos leaves fewer than 2 "
             "to train on: give a smaller number"
         )
-    test = spread_evenly(views, holdout) if holdout else views[:0]
+    test = evenly_spaced(views, holdout) if holdout else views[:0]
     return dataclasses.replace(scene, pool=np.setdiff1d(views, test), test=test)
 
 
@@ -125,10 +125,10 @@ def photo_curvature(problem: Problem, train: TrainState, folder: pathlib.Path, s
     if (kept := read_arrays(path, "jac_sq_sum")) is not None:
         return jnp.asarray(kept["jac_sq_sum"])
     is_training = view_mask(problem.table, problem.scene.pool)
-    toolbox = problem.toolbox
-    situation = Situation(train, problem.table, is_training, num_rays=0, label="photos")
+    setup = problem.setup
+    acquired = Acquired(train, problem.table, is_training, num_rays=0, label="photos")
     jac_sq_sum = training_curvature(
-        stream_key(seed, "photos"), toolbox, situation, weighting=toolbox.laplace.weighting
+        stream_key(seed, "photos"), setup, acquired, weighting=setup.laplace.weighting
     )
     write_arrays(path, jac_sq_sum=np.asarray(jac_sq_sum))
     return jac_sq_sum
@@ -181,10 +181,10 @@ def photo_rays(problem: Problem) -> int:
     return int(num_training_pixels(problem.scene, problem.scene.pool).sum())
 
 
-def photo_situation(problem: Problem, train: TrainState, cameras: Cameras) -> Situation:
+def photos_acquired(problem: Problem, train: TrainState, cameras: Cameras) -> Acquired:
     """All photos are trained on; C cameras are candidates."""
     is_training = view_mask(problem.table, problem.scene.pool)
-    return Situation(
+    return Acquired(
         train,
         problem.table,
         is_training,
@@ -201,20 +201,20 @@ def photo_information(
 
     The sum of Eq 13 knows no colours, so a pose is enough.
     """
-    toolbox = problem.toolbox
-    situation = photo_situation(problem, train, cameras)
+    setup = problem.setup
+    acquired = photos_acquired(problem, train, cameras)
     precision = posterior_precision(
         jac_sq_sum,
-        num_rays=situation.num_rays,
-        prior_weight=toolbox.laplace.prior_weight,
-        weighting=toolbox.laplace.weighting,
+        num_rays=acquired.num_rays,
+        prior_weight=setup.laplace.prior_weight,
+        weighting=setup.laplace.weighting,
     )
     return Information(
         precision,
         make_cached_curvature_fn(
-            make_candidate_curvature_fn(toolbox, situation, cameras, scale),
-            num_vertices=toolbox.grid.num_vertices,
-            group_size=toolbox.curvature.group_size,
+            make_candidate_curvature_fn(setup, acquired, cameras, scale),
+            num_vertices=setup.grid.num_vertices,
+            group_size=setup.curvature.group_size,
         ),
     )
 
@@ -257,15 +257,15 @@ def suggest(
     gains = information_gains(information, len(cameras), "what candidates would tell")
 
     source_key, choose_key = jax.random.split(stream_key(options.seed, "choice"))
-    situation = photo_situation(problem, train, cameras)
+    acquired = photos_acquired(problem, train, cameras)
     fields = {"mean_uncertainty_fn": lambda rows, picked: scores[rows], "information": information}
     if policy.uncertainty != "laplace" or not policy.needs <= fields.keys():
         everyone = Candidates(cameras, np.arange(len(cameras)), np.ones(len(cameras), bool))
-        fields |= problem.inputs(policy, source_key, situation, everyone).fields
+        fields |= problem.inputs(policy, source_key, acquired, everyone).fields
     context = make_context(
         cameras.positions,
         training_positions=np.asarray(problem.table.cameras.positions),
-        is_training_view=situation.is_training_view,
+        is_training_view=acquired.is_training_view,
         centre=centre,
         **fields,
     )
@@ -278,7 +278,7 @@ def suggest(
         add_fn=add_curvature,
         score_fn=partial(candidate_gains, gain=log_det_gain),
     )
-    photos = take(problem.scene.cameras, spread_evenly(problem.scene.pool, NUM_COMPARED))
+    photos = take(problem.scene.cameras, evenly_spaced(problem.scene.pool, NUM_COMPARED))
     again = photo_information(problem, train, jac_sq_sum, photos, scale)
     photo_gains = information_gains(again, len(photos), "what photos would tell again")
     return Suggestion(selected, scores, info, worth, float(np.median(photo_gains)))

@@ -29,7 +29,7 @@ from bavs_jax.uncertainty.conformal_report import coverage_report, to_json
 from bavs_jax.uncertainty.conformal_scale import ViewErrors, ViewGroups, split_views
 from experiments.build import RENDER_CHUNK
 from experiments.errors import ConfigError, WorkdirError
-from experiments.evaluate import spread_evenly
+from experiments.evaluate import evenly_spaced
 from experiments.files import read_versioned, write_json
 from experiments.progress import track
 from experiments.reporting.uncertainty import LEVEL
@@ -58,11 +58,11 @@ def interval_views(scene, is_training_view, num: int) -> np.ndarray:
       is_training_view: [V or more] bool.
       num: how many, evenly spaced; 0: all.
     """
-    test = spread_evenly(scene.test, num)
+    test = evenly_spaced(scene.test, num)
     unused = np.asarray(scene.pool)[~np.asarray(is_training_view)[scene.pool]]
     if num:
         missing = num - len(test)
-        unused = spread_evenly(unused, missing) if missing else unused[:0]
+        unused = evenly_spaced(unused, missing) if missing else unused[:0]
     return np.concatenate([test, unused])
 
 

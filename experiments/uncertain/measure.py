@@ -20,9 +20,9 @@ import numpy as np
 from bavs_jax.metrics.ause import ERRORS, Sparsification, mean_sparsification, variant_name
 from bavs_jax.rendering.images import render_views
 from bavs_jax.uncertainty.bands import uncertainty_of
-from bavs_jax.uncertainty.model import Situation
+from bavs_jax.uncertainty.model import Acquired
 from experiments.build import RENDER_CHUNK, Problem
-from experiments.evaluate import mean_quality, spread_evenly
+from experiments.evaluate import evenly_spaced, mean_quality
 from experiments.files import read_arrays, read_json, stack_pictures, write_arrays, write_json
 from experiments.keys import stream_key
 from experiments.progress import track
@@ -49,22 +49,22 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
         return
     commit = code_commit()  # now: files may be edited while it runs
     scene, options = problem.scene, config.evaluation
-    situation = trained_situation(config, problem, folder, seed, command)
-    view_ids = spread_evenly(scene.test, options.num_views)
+    acquired = trained_views(config, problem, folder, seed, command)
+    view_ids = evenly_spaced(scene.test, options.num_views)
     key = stream_key(seed, "evaluation")
     errors_of = partial(pixel_errors, scene, view_ids, scale_depth=options.scale_depth)
 
     common = folder / "uncertainty" / "common" / f"seed_{seed}.npz"
     if (kept := load_images(common)) is None:
-        fitted = fit_model(problem, COMMON_MODEL, key, situation)
-        kept = render_model(scene, fitted, view_ids, f"{situation.label}: {COMMON_MODEL}")
+        fitted = fit_model(problem, COMMON_MODEL, key, acquired)
+        kept = render_model(scene, fitted, view_ids, f"{acquired.label}: {COMMON_MODEL}")
         save_images(common, *kept)
     common_errors = errors_of(kept[0])
     common_psnr = mean_quality(scene, view_ids, kept[0])["psnr"]
 
     for name in missing:
-        fitted = fit_model(problem, name, key, situation)
-        label = f"{situation.label}: {name}"
+        fitted = fit_model(problem, name, key, acquired)
+        label = f"{acquired.label}: {name}"
         images, render_seconds = kept
         if name != COMMON_MODEL:
             images, render_seconds = render_model(scene, fitted, view_ids, label)
@@ -80,11 +80,11 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
                 arrays[f"{field}_{variant}_by_error"] = one.by_error
         quality = mean_quality(scene, view_ids, images)
         if config.num_pictures:
-            shown = spread_evenly(np.arange(len(view_ids)), config.num_pictures)
+            shown = evenly_spaced(np.arange(len(view_ids)), config.num_pictures)
             arrays |= picture_arrays(scene, view_ids, images, shown)
         path = row_path(folder, name, seed)
         band, numbers, interval_seconds = _measure_intervals(
-            config, scene, fitted, situation, folder, name, seed
+            config, scene, fitted, acquired, folder, name, seed
         )
         seconds = {"fit": fitted.seconds, "render": render_seconds, "intervals": interval_seconds}
         write_arrays(path.with_suffix(".npz"), **arrays, **band)
@@ -92,7 +92,7 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
             "row_version": ROW_VERSION,
             "model": name,
             "seed": seed,
-            "num_views": int(np.sum(situation.is_training_view)),
+            "num_views": int(np.sum(acquired.is_training_view)),
             "num_test_views": len(view_ids),
             "psnr": quality["psnr"],
             "ssim": quality["ssim"],
@@ -105,11 +105,11 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
         write_json(path, row)
 
 
-def trained_situation(config, problem: Problem, folder: pathlib.Path, seed: int, command: str):
+def trained_views(config, problem: Problem, folder: pathlib.Path, seed: int, command: str):
     """The field of a seed at the end of its run of the config's first policy."""
     policy = config.policies[0] if config.num_rounds else FIRST_ROUND
     run = train_run(config, problem, folder, policy, seed, command)
-    return run.situation._replace(label=f"seed {seed}")
+    return run.acquired._replace(label=f"seed {seed}")
 
 
 def _is_done(path: pathlib.Path) -> bool:
@@ -119,11 +119,11 @@ def _is_done(path: pathlib.Path) -> bool:
     return is_current and read_arrays(path.with_suffix(".npz")) is not None
 
 
-def _measure_intervals(config, scene, fitted, situation, folder, name: str, seed: int) -> tuple:
+def _measure_intervals(config, scene, fitted, acquired, folder, name: str, seed: int) -> tuple:
     """Calibrates intervals, writes their file, and measures and shows them on test views."""
     options = config.evaluation
-    groups = intervals.split(scene, situation.is_training_view, options.num_interval_views, seed)
-    label = f"{situation.label}: {name}"
+    groups = intervals.split(scene, acquired.is_training_view, options.num_interval_views, seed)
+    label = f"{acquired.label}: {name}"
     samples, seconds = intervals.sample_views(
         scene,
         fitted.render,
@@ -209,15 +209,15 @@ class FittedModel(NamedTuple):
     rays_per_pixel: int = 1  # see `render_views`
 
 
-def fit_model(problem: Problem, name: str, key, situation: Situation) -> FittedModel:
-    """Fits a model to the training views of a situation."""
+def fit_model(problem: Problem, name: str, key, acquired: Acquired) -> FittedModel:
+    """Fits a model to the training views of a acquired."""
     fns = problem.model_fns(name)
     start = time.perf_counter()
-    fitted = jax.block_until_ready(fns.fit(key, situation))
+    fitted = jax.block_until_ready(fns.fit(key, acquired))
     seconds = time.perf_counter() - start
 
     def render(rays):
-        rendered = fns.render(fitted, situation.train, rays)
+        rendered = fns.render(fitted, acquired.train, rays)
         return {k: rendered[k] for k in IMAGES if k in rendered}
 
     return FittedModel(render, seconds, problem.config.rays_per_pixel)

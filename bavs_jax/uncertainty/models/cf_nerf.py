@@ -10,25 +10,25 @@ from bavs_jax.fields.flow_field import base_draws
 from bavs_jax.models.ray_field import RayField
 from bavs_jax.rendering.render import basic_images
 from bavs_jax.uncertainty.measures import colour_variance
-from bavs_jax.uncertainty.model import FLOW, ModelFns, Toolbox, UncertaintyModel
+from bavs_jax.uncertainty.model import FLOW, ModelFns, SceneSetup, UncertaintyModel
 
 DRAWS_SEED = 0  # the same draws for every image of every run
 
 
-def make_fns(toolbox: Toolbox) -> ModelFns:
+def make_fns(setup: SceneSetup) -> ModelFns:
     """The flows are trained beside the run's own field; K fixed draws are rendered.
 
     The last draw is the base's mean. "uncertainty" is the variance of colour over the draws,
     "depth_uncertainty" that of depth; "rgb" and "depth" are the means over the draws.
     """
-    model = toolbox.models[FLOW]
+    model = setup.models[FLOW]
     if not isinstance(model, RayField):
         raise TypeError(f"{FLOW}: must be a RayField, whose field is drawn anew")
-    noise = base_draws(jax.random.key(DRAWS_SEED), toolbox.num_draws, with_mean=True)
+    noise = base_draws(jax.random.key(DRAWS_SEED), setup.num_draws, with_mean=True)
 
     def images(state, rays):
         def render(noise):
-            drawn = model.field._replace(apply=partial(toolbox.flow.apply, noise=noise))
+            drawn = model.field._replace(apply=partial(setup.flow.apply, noise=noise))
             return basic_images(dataclasses.replace(model, field=drawn).render(state, rays))
 
         draws = jax.vmap(render)(noise)
@@ -38,12 +38,12 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
             "depth_uncertainty": draws["depth"].var(0),
         }
 
-    compiled = jit_over_rays(images, toolbox.mesh, spread=(False, True))
+    compiled = jit_over_rays(images, setup.mesh, sharded=(False, True))
 
-    def fit(key, situation):
-        if toolbox.kind == FLOW:
+    def fit(key, acquired):
+        if setup.kind == FLOW:
             return None
-        return toolbox.train(FLOW, key, situation)
+        return setup.train(FLOW, key, acquired)
 
     def render(fitted, train, rays):
         state = train if fitted is None else fitted

@@ -12,7 +12,7 @@ from bavs_jax.devices import jit_over_rays
 from bavs_jax.rendering.render import Channel, basic_images
 from bavs_jax.uncertainty.images import make_image_fn, render_stack
 from bavs_jax.uncertainty.measures import direction_novelty
-from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
+from bavs_jax.uncertainty.model import ModelFns, SceneSetup, UncertaintyModel
 
 
 class Covered(NamedTuple):
@@ -23,9 +23,9 @@ class Covered(NamedTuple):
     depth_maps: np.ndarray  # [V + C, H, W] scene units, 0 where empty
 
 
-def make_fns(toolbox: Toolbox) -> ModelFns:
+def make_fns(setup: SceneSetup) -> ModelFns:
     """Depth maps of the training views are fitted, so that a view covers only what it sees."""
-    depth_images = make_image_fn(toolbox, toolbox.kind)
+    depth_images = make_image_fn(setup, setup.kind)
 
     def images(state, covered, rays):
         novelty = partial(
@@ -35,25 +35,25 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
             depth_maps=covered.depth_maps,
         )
         channels = {"uncertainty": Channel(novelty)}
-        rendering = toolbox.model.render(state, rays, channels=channels)
+        rendering = setup.model.render(state, rays, channels=channels)
         return {**basic_images(rendering), **rendering.channels}
 
-    compiled = jit_over_rays(images, toolbox.mesh, spread=(False, False, True))
+    compiled = jit_over_rays(images, setup.mesh, sharded=(False, False, True))
 
     def look(train, cameras, mask, scale):
         depth_fn = partial(depth_images, train)
         return render_stack(
-            depth_fn, cameras, mask, scale=scale, chunk=toolbox.chunk, names=("depth",)
+            depth_fn, cameras, mask, scale=scale, chunk=setup.chunk, names=("depth",)
         )
 
-    def fit(key, situation):
+    def fit(key, acquired):
         del key
         cameras = jax.tree.map(
-            lambda a, b: jnp.concatenate([a, b]), situation.table.cameras, situation.candidates
+            lambda a, b: jnp.concatenate([a, b]), acquired.table.cameras, acquired.candidates
         )
-        unused = np.zeros(len(situation.candidates), bool)
-        mask = np.concatenate([np.asarray(situation.is_training_view), unused])
-        small, depth_maps = look(situation.train, cameras, mask, toolbox.image_scale)
+        unused = np.zeros(len(acquired.candidates), bool)
+        mask = np.concatenate([np.asarray(acquired.is_training_view), unused])
+        small, depth_maps = look(acquired.train, cameras, mask, setup.image_scale)
         return Covered(small, mask, depth_maps)
 
     def condition(covered, train, picked):

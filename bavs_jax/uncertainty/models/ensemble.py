@@ -5,17 +5,17 @@ import jax.numpy as jnp
 
 from bavs_jax.uncertainty.images import make_image_fn
 from bavs_jax.uncertainty.measures import ensemble_uncertainty
-from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
+from bavs_jax.uncertainty.model import ModelFns, SceneSetup, UncertaintyModel
 
 
-def make_fns(toolbox: Toolbox) -> ModelFns:
+def make_fns(setup: SceneSetup) -> ModelFns:
     """Further fields are trained like the run's own, which is the first member."""
-    images = make_image_fn(toolbox, toolbox.kind)
-    known_background = toolbox.model.background is not None
+    images = make_image_fn(setup, setup.kind)
+    known_background = setup.model.background is not None
 
-    def fit(key, situation):
-        keys = jax.random.split(key, toolbox.ensemble_size - 1)
-        return [toolbox.train(toolbox.kind, k, situation) for k in keys]
+    def fit(key, acquired):
+        keys = jax.random.split(key, setup.ensemble_size - 1)
+        return [setup.train(setup.kind, k, acquired) for k in keys]
 
     def render(fitted, train, rays):
         members = [images(state, rays) for state in (train, *fitted)]

@@ -2,16 +2,14 @@
 
 from bavs_jax.uncertainty.images import make_image_fn
 from bavs_jax.uncertainty.measures import ray_entropy
-from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
+from bavs_jax.uncertainty.model import ModelFns, SceneSetup, UncertaintyModel
 
 
-def make_fns(toolbox: Toolbox) -> ModelFns:
+def make_fns(setup: SceneSetup) -> ModelFns:
     """Read off the rendering weights: nothing is fitted."""
-    images = make_image_fn(
-        toolbox, toolbox.kind, lambda out: {"uncertainty": ray_entropy(out.weights)}
-    )
+    images = make_image_fn(setup, setup.kind, lambda out: {"uncertainty": ray_entropy(out.weights)})
     return ModelFns(
-        fit=lambda key, situation: None, render=lambda fitted, train, rays: images(train, rays)
+        fit=lambda key, acquired: None, render=lambda fitted, train, rays: images(train, rays)
     )
 
 

@@ -8,10 +8,10 @@ from bavs_jax.fields.deformation import cell_sides, vertices_in_box
 from bavs_jax.pixel_table import training_pixels
 from bavs_jax.uncertainty.channel import vertex_variance
 from bavs_jax.uncertainty.model import (
+    Acquired,
     LaplaceOptions,
     ModelFns,
-    Situation,
-    Toolbox,
+    SceneSetup,
     UncertaintyModel,
 )
 from bavs_jax.uncertainty.posterior import offset_variance
@@ -20,20 +20,20 @@ from bavs_jax.uncertainty.scoring import make_render_chunk_fn
 from bavs_jax.uncertainty.streaming import table_rays
 
 
-def training_curvature(key, toolbox: Toolbox, situation: Situation, weighting: str) -> jax.Array:
+def training_curvature(key, setup: SceneSetup, acquired: Acquired, weighting: str) -> jax.Array:
     """`jac_sq_sum` [G, 3] over all training rays, or over a uniform subset that stands for them."""
-    view_ids, pixel_ids = training_pixels(situation.table, situation.is_training_view)
-    most, scale = toolbox.laplace.max_rays, 1.0
+    view_ids, pixel_ids = training_pixels(acquired.table, acquired.is_training_view)
+    most, scale = setup.laplace.max_rays, 1.0
     if most is not None and len(view_ids) > most:
         seed = int(jax.random.randint(key, (), 0, 2**31 - 1))
         rows = np.sort(np.random.default_rng(seed).permutation(len(view_ids))[:most])
         scale = len(view_ids) / most
         view_ids, pixel_ids = view_ids[rows], pixel_ids[rows]
-    return scale * toolbox.curvature(
-        situation.train.model,
-        label=f"{situation.label}: curvature",
+    return scale * setup.curvature(
+        acquired.train.model,
+        label=f"{acquired.label}: curvature",
         weighting=weighting,
-        **table_rays(situation.table, view_ids, pixel_ids, weighting),
+        **table_rays(acquired.table, view_ids, pixel_ids, weighting),
     )
 
 
@@ -48,21 +48,21 @@ def laplace_variance(jac_sq_sum: jax.Array, num_rays, options: LaplaceOptions) -
     )
 
 
-def make_fns(toolbox: Toolbox) -> ModelFns:
+def make_fns(setup: SceneSetup) -> ModelFns:
     """The variance of each vertex is what is fitted; it is rendered as a channel."""
-    options = toolbox.laplace
+    options = setup.laplace
     render_chunk = make_render_chunk_fn(
-        toolbox.model,
-        toolbox.grid,
+        setup.model,
+        setup.grid,
         variant=options.variant,
         scale=options.scale,
         extent=options.extent,
-        mesh=toolbox.mesh,
+        mesh=setup.mesh,
     )
 
-    def fit(key, situation):
-        jac_sq_sum = training_curvature(key, toolbox, situation, options.weighting)
-        variance = laplace_variance(jac_sq_sum, situation.num_rays, options)
+    def fit(key, acquired):
+        jac_sq_sum = training_curvature(key, setup, acquired, options.weighting)
+        variance = laplace_variance(jac_sq_sum, acquired.num_rays, options)
         return jax.block_until_ready(jnp.asarray(variance))
 
     def render(fitted, train, rays):
@@ -71,19 +71,19 @@ def make_fns(toolbox: Toolbox) -> ModelFns:
     return ModelFns(fit, render)
 
 
-def make_predictive_fns(toolbox: Toolbox) -> ModelFns:
+def make_predictive_fns(setup: SceneSetup) -> ModelFns:
     """Ours: what the offsets' posterior means for colour and depth (`predictive.py`).
 
     The variances [G, 3] of the offsets are what is fitted.
     """
-    render_rays = make_predictive_fn(toolbox.model, toolbox.grid, mesh=toolbox.mesh)
-    offset_std = toolbox.laplace.offset_cells * cell_sides(toolbox.grid)
+    render_rays = make_predictive_fn(setup.model, setup.grid, mesh=setup.mesh)
+    offset_std = setup.laplace.offset_cells * cell_sides(setup.grid)
 
-    def fit(key, situation):
-        jac_sq_sum = training_curvature(key, toolbox, situation, "eq13")
+    def fit(key, acquired):
+        jac_sq_sum = training_curvature(key, setup, acquired, "gauss_newton")
         variance = offset_variance(jac_sq_sum, offset_std)
-        if toolbox.laplace.extent == "box":
-            variance = variance * vertices_in_box(toolbox.grid)[:, None]
+        if setup.laplace.extent == "box":
+            variance = variance * vertices_in_box(setup.grid)[:, None]
         return jax.block_until_ready(jnp.asarray(variance, jnp.float32))
 
     def render(fitted, train, rays):

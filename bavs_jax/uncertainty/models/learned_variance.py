@@ -6,7 +6,7 @@ from bavs_jax.rendering.compositing import rendered_variance
 from bavs_jax.rendering.render import RayRendering
 from bavs_jax.uncertainty.images import make_image_fn
 from bavs_jax.uncertainty.measures import variance_reduction
-from bavs_jax.uncertainty.model import VARIANCE, ModelFns, Toolbox, UncertaintyModel
+from bavs_jax.uncertainty.model import VARIANCE, ModelFns, SceneSetup, UncertaintyModel
 
 
 def _measures(rendering: RayRendering) -> dict[str, jax.Array]:
@@ -17,17 +17,17 @@ def _measures(rendering: RayRendering) -> dict[str, jax.Array]:
     }
 
 
-def make_fns(toolbox: Toolbox) -> ModelFns:
+def make_fns(setup: SceneSetup) -> ModelFns:
     """A run whose own field has the variance needs no other; else one is trained beside it.
 
     "gain" is how much of the variance along the ray its observation would remove.
     """
-    images = make_image_fn(toolbox, VARIANCE, _measures)
+    images = make_image_fn(setup, VARIANCE, _measures)
 
-    def fit(key, situation):
-        if toolbox.kind == VARIANCE:
+    def fit(key, acquired):
+        if setup.kind == VARIANCE:
             return None
-        return toolbox.train(VARIANCE, key, situation)
+        return setup.train(VARIANCE, key, acquired)
 
     def render(fitted, train, rays):
         return images(train if fitted is None else fitted, rays)

@@ -6,26 +6,26 @@ import numpy as np
 
 from bavs_jax.devices import jit_over_rays
 from bavs_jax.uncertainty.images import make_image_fn, render_stack
-from bavs_jax.uncertainty.model import ModelFns, Toolbox, UncertaintyModel
+from bavs_jax.uncertainty.model import ModelFns, SceneSetup, UncertaintyModel
 from bavs_jax.uncertainty.warp import WarpSources, warp_disagreement
 
 
-def make_fns(toolbox: Toolbox) -> ModelFns:
+def make_fns(setup: SceneSetup) -> ModelFns:
     """Renders of the training views are fitted."""
-    images = make_image_fn(toolbox, toolbox.kind)
+    images = make_image_fn(setup, setup.kind)
 
     spread = (True, True, True, True, False)
-    disagreement = jit_over_rays(warp_disagreement, toolbox.mesh, spread=spread)
+    disagreement = jit_over_rays(warp_disagreement, setup.mesh, sharded=spread)
 
-    def fit(key, situation):
+    def fit(key, acquired):
         del key
-        mask = np.asarray(situation.is_training_view)
+        mask = np.asarray(acquired.is_training_view)
         cameras, rgb, depth = render_stack(
-            partial(images, situation.train),
-            situation.table.cameras,
+            partial(images, acquired.train),
+            acquired.table.cameras,
             mask,
-            scale=toolbox.image_scale,
-            chunk=toolbox.chunk,
+            scale=setup.image_scale,
+            chunk=setup.chunk,
         )
         return WarpSources(cameras, rgb, depth, mask)
 

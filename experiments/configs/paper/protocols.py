@@ -90,9 +90,9 @@ def blender_mip() -> ConfigDict:
 def _use_large_grid(config: ConfigDict, num_steps: int) -> None:
     """The hash grid of nerfacto's size, and as many rays at a time."""
     config.image_size = 0  # as the files are
-    config.field.num_levels = 16
-    config.field.finest = 2048
-    config.field.log2_table_size = 19
+    config.hash_grid.num_levels = 16
+    config.hash_grid.finest = 2048
+    config.hash_grid.log2_table_size = 19
     config.train.num_steps = num_steps
     config.train.num_rays = 4096
     config.train.capacity = 262_144
@@ -106,8 +106,8 @@ def nerfacto() -> ConfigDict:
     """
     config = capture.get_config()
     _use_large_grid(config, num_steps=30_000)
-    config.field.direction_degree = 4
-    config.field.appearance_features = 32
+    config.hash_grid.direction_degree = 4
+    config.hash_grid.appearance_features = 32
     config.proposal.num_proposals = (256, 96)
     config.proposal.num_samples = 48
     config.proposal.num_levels = 5
