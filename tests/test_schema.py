@@ -136,7 +136,7 @@ def test_an_option_that_is_a_group_or_missing_or_unknown_is_named():
         ("policies", ("bavz",), "'bavs'"),
         ("seeds", (2**32,), "0 to 4,294,967,295"),
         ("load.pool_size", 1.5, "a whole count"),
-        ("hash_grid.finest", 8, "is 8; give at least field.coarsest, 16"),
+        ("hash_grid.finest", 8, "is 8; give at least hash_grid.coarsest, 16"),
         ("proposal.finest", (8, 64), "give at least proposal.coarsest, 16"),
         ("candidates.min_train_distance", 0.5, "give both min_train_distance and"),
     ],
