@@ -67,11 +67,14 @@ class InputMaker:
         track: Track,
         true_error_fn: TrueErrorFn | None = None,
     ):
-        """Args:
-        model_fns: from the name of an uncertainty model.
-        options: how candidates are looked at.
-        track: shows progress.
-        true_error_fn: of a training state; None where candidates have no photos.
+        """Makes nothing yet.
+
+        Args:
+          setup: the scene's models and grid.
+          model_fns: from the name of an uncertainty model.
+          options: how candidates are looked at.
+          track: shows progress.
+          true_error_fn: of a training state; None where candidates have no photos.
         """
         self.setup, self.model_fns, self.options = setup, model_fns, options
         self.track, self.true_error_fn = track, true_error_fn

@@ -27,9 +27,7 @@ MAX_GROUP, MAX_GROUP_BYTES = 8, 2**26
 class RayFacts(TypedDict, total=False):
     """What is known of each of N rays beside the ray itself; what is left out is None."""
 
-    targets: (
-        Array | None
-    )  # [N, 3] true colours; needed by `residual_weighted` and `empirical_fisher`
+    targets: Array | None  # [N, 3] true colours; `gauss_newton` needs none
     # [N] int: views trained on that the rays belong to, which a model may read in a way of their
     # own. None for rays of any other camera, read as when it renders.
     view_ids: Array | None
@@ -259,10 +257,12 @@ class CurvatureOfRays:
         track: Track,
         mesh: Mesh | None = None,
     ):
-        """Args:
-        model, grid, mesh: see `make_curvature_fn`.
-        group_size: most groups of rays; all calls share its compilations.
-        track: shows progress.
+        """Compiles nothing yet.
+
+        Args:
+          model, grid, mesh: see `make_curvature_fn`.
+          group_size: most groups of rays; all calls share its compilations.
+          track: shows progress.
         """
         self.group_size = group_size
         self._track = track
@@ -295,7 +295,7 @@ class CurvatureOfRays:
                 num_groups=self.group_size,
                 **of_rays,
             )
-        return sums if "group_ids" in of_rays else sums[0]
+        return sums[0] if of_rays.get("group_ids") is None else sums
 
 
 def _chunks(rows: np.ndarray, size: int) -> Iterator[tuple[np.ndarray, int]]:
