@@ -5,13 +5,12 @@ from __future__ import annotations
 import pathlib
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 
 from experiments.reporting import plots
-from experiments.reporting.page import write_template
+from experiments.reporting.page import Section, write_page
 from experiments.reporting.plots import seconds
 from experiments.reporting.results import read_result
 from experiments.reporting.tables import Cell, Collected, Table, dash
@@ -198,14 +197,13 @@ def quality_plot(result: dict) -> str:
 def write_benchmark_page(path: pathlib.Path, result: dict) -> None:
     """Rates, and growth where it was measured."""
     note = " ".join(facts(result)) + " Rates are medians over uniformly drawn training pixels."
-    sections = [{"title": "Each stage", "note": note, "plot": "", "table": stage_table(result)}]
+    sections = [Section("Each stage", stage_table(result), note)]
     if (table := growth_table(result)) is not None:
         note = "Medians of warm runs. An exponent of 1 is linear growth; below 1, a fixed cost "
         note += "still shows, which the straight line allows for."
-        plot = Markup(growth_plot(result["growth"]))
-        sections.append({"title": "Growth", "note": note, "plot": plot, "table": table})
+        sections.append(Section("Growth", table, note, [growth_plot(result["growth"])]))
     title = f"How fast bavs_jax is: {result['scene']}, {result['num_views']} views"
-    _write_page(path, title, result, sections)
+    write_page(path, title=title, made=result, sections=sections)
 
 
 def write_quality_page(path: pathlib.Path, result: dict) -> None:
@@ -216,10 +214,6 @@ def write_quality_page(path: pathlib.Path, result: dict) -> None:
         f"{result['num_test_views']} test views, measured while the clock stands. The last "
         "time is that of the first look from which on none is 0.3 dB below the best."
     )
-    section = {"title": "Seconds to quality", "note": note, "plot": Markup(quality_plot(result))}
+    section = Section("Seconds to quality", quality_table(result), note, [quality_plot(result)])
     title = f"Time to quality: {result['scene']}, {result['num_views']} views"
-    _write_page(path, title, result, [section | {"table": quality_table(result)}])
-
-
-def _write_page(path, title: str, made: dict, sections: list[dict]) -> None:
-    write_template(path, pathlib.Path(__file__).parent, title=title, made=made, sections=sections)
+    write_page(path, title=title, made=result, sections=[section])
