@@ -1,6 +1,7 @@
 """What options may be: the schema knows them all, every config passes, bad values do not."""
 
 import importlib
+import json
 import math
 import pkgutil
 import re
@@ -20,6 +21,7 @@ from experiments.errors import ConfigError
 from experiments.schema import FLAG, SCHEMA, TEXT, check_config, leaves
 from experiments.suggest.choosing import default_config
 from experiments.sweeps.axes import MAX_TRIALS, parse_axes
+from experiments.trained import saved_config
 from tests.toy_runs import OVERRIDES, toy_config
 from tests.toy_scenes import toy_scene
 
@@ -216,3 +218,28 @@ def test_a_sweep_of_the_largest_size_is_taken():
 def test_the_toy_config_passes():
     check_config(toy_config())
     assert OVERRIDES.keys() <= SCHEMA.keys()
+
+
+@pytest.mark.parametrize(
+    "old, new",
+    [
+        ("eq13", "gauss_newton"),
+        ("eq11", "residual_weighted"),
+        ("empirical", "empirical_fisher"),
+        ("gauss_newton", "gauss_newton"),
+    ],
+)
+def test_old_names_are_read_as_the_new_ones(old, new):
+    config = base.get_config()
+    config.lock()
+    config.uncertainty.weighting = old
+    assert check_config(config).uncertainty.weighting == new
+
+
+def test_a_run_saved_under_the_old_names_is_read(tmp_path):
+    saved = base.get_config().to_dict()
+    saved["field"] = saved.pop("hash_grid") | {"finest": 64}
+    saved["uncertainty"]["weighting"] = "eq11"
+    (tmp_path / "config.json").write_text(json.dumps(saved))
+    config = saved_config(tmp_path)
+    assert (config.hash_grid.finest, config.uncertainty.weighting) == (64, "residual_weighted")
