@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -17,7 +18,13 @@ from bavs_jax.models.objectives import (
 from bavs_jax.models.ray_field import RayField, RayTraining
 from bavs_jax.scenes import Scene
 from bavs_jax.training.fit import Trainer, check_call, fit
-from bavs_jax.training.train import TrainState, init_train_state, make_optimiser, make_train_fn
+from bavs_jax.training.train import (
+    TrainCall,
+    TrainState,
+    init_train_state,
+    make_optimiser,
+    make_train_fn,
+)
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE, Acquired
 from experiments.build_field import build_field, field_background, learning_rate
 from experiments.errors import ConfigError
@@ -80,7 +87,11 @@ def build_model(
 
 
 def build_trainer(config, model: RayField) -> Trainer:
-    """How a model is trained in each round of a config."""
+    """How a model is trained in each round of a config.
+
+    At first one ray goes through each pixel, so that a step sees as many pixels as rays; then
+    `config.rays_per_pixel`, whose mean is what a photo shows.
+    """
     train = config.train
     optimiser, schedule = make_optimiser(
         learning_rate=learning_rate(config),
@@ -91,14 +102,29 @@ def build_trainer(config, model: RayField) -> Trainer:
         second_decay=train.adam_b2,
         epsilon=train.adam_eps,
     )
-    call = make_train_fn(
-        model,
-        optimiser,
-        schedule,
-        average_age=train.average_age,
-        steps_per_call=train.steps_per_call,
-        mesh=model.mesh,
-    )
+
+    def call_of(rays_per_pixel: int) -> TrainCall:
+        training = model.training._replace(rays_per_pixel=rays_per_pixel)
+        return make_train_fn(
+            dataclasses.replace(model, training=training),
+            optimiser,
+            schedule,
+            average_age=train.average_age,
+            steps_per_call=train.steps_per_call,
+            mesh=model.mesh,
+        )
+
+    later = call_of(config.rays_per_pixel)
+    num_first = train.one_ray_share * train.num_steps
+    if config.rays_per_pixel == 1 or num_first == 0:
+        call = later
+    else:
+        first = call_of(1)
+
+        def call(key, state, table, is_training_view):
+            this = first if int(state.step) < num_first else later
+            return this(key, state, table, is_training_view)
+
     fresh = jax.jit(partial(init_train_state, model=model, optimiser=optimiser))
     num_calls = -(-train.num_steps // train.steps_per_call)
     return Trainer(

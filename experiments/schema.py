@@ -195,6 +195,7 @@ SCHEMA = {
     "train.num_steps": whole(1, 10_000_000),
     "train.num_rays": whole(1, 1 << 20),
     "train.capacity": whole(1, 1 << 24),
+    "train.one_ray_share": number(0.0, 1.0),
     "train.look_ahead": whole(0, 64),
     "train.learning_rate": positive(1.0, "what suits the field kind"),
     "train.final_share": positive(1.0),

@@ -138,3 +138,29 @@ def test_every_kind_of_training_fits_every_network(field_kind, kind):
     after, info = jax.eval_shape(trainer.call, KEY, state, table, np.ones(scene.num_views, bool))
     assert jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, state)
     assert info.loss.shape == ()
+
+
+def test_one_ray_a_pixel_comes_first_and_several_later():
+    """Each call does what a trainer of that number of rays alone does from the same state."""
+    scene, table = toy_scene(), make_pixel_table(toy_scene())
+    mask, ends = np.ones(scene.num_views, bool), {}
+    for name, options in {
+        "one": {"rays_per_pixel": 1},
+        "four": {"rays_per_pixel": 4, "train__one_ray_share": 0.0},
+        "both": {"rays_per_pixel": 4, "train__one_ray_share": 0.5},
+    }.items():
+        config = toy_config(
+            loader="blender", train__num_steps=8, train__steps_per_call=4, **options
+        )
+        trainer = build_problem(config, scene).trainer
+        state, _ = trainer.call(KEY, trainer.init(KEY), table, mask)
+        ends[name] = jax.tree.map(np.asarray, state), trainer
+    jax.tree.map(np.testing.assert_array_equal, ends["both"][0], ends["one"][0])
+    assert any(
+        (a != b).any() for a, b in zip(*map(jax.tree.leaves, (ends["one"][0], ends["four"][0])))
+    )
+    later = [
+        ends[name][1].call(KEY, jax.tree.map(jnp.asarray, ends["one"][0]), table, mask)[0]
+        for name in ("both", "four")
+    ]
+    jax.tree.map(np.testing.assert_array_equal, *later)

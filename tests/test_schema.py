@@ -39,7 +39,7 @@ ZERO_IS_FINE = {
     *("flow_training.entropy_weight", "proposal.anneal_steps", "proposal.interlevel_weight"),
     *("proposal.distortion_weight", "proposal.penalty_weight", "train.learning_rate"),
     *("train.warmup_steps", "train.max_grad_norm", "train.adam_b2", "train.penalty_weight"),
-    *("train.average_age", "train.roughness_weight", "train.look_ahead"),
+    *("train.average_age", "train.roughness_weight", "train.look_ahead", "train.one_ray_share"),
     *("uncertainty.prior_weight", "uncertainty.max_rays", "evaluation.num_views"),
     *("evaluation.num_interval_views", "evaluation.num_interval_pixels"),
     *("candidates.min_train_distance", "candidates.min_candidate_distance"),

@@ -114,6 +114,7 @@ def get_config() -> ConfigDict:
     config.train.num_steps = 4000  # optimiser steps of each round
     config.train.num_rays = 2048  # of one step; those that do not fit into it are left out
     config.train.capacity = 8192  # samples evaluated in one step
+    config.train.one_ray_share = 0.5  # of a round's steps, the first, with one ray for each pixel
     config.train.look_ahead = 2  # times as many are looked at, to leave out hidden ones; 0: never
     config.train.random_background = True  # for each ray, where photos have alpha
     config.train.learning_rate = 0.0  # 0: what suits the field kind
