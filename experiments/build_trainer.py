@@ -114,12 +114,9 @@ def build_trainer(config, model: RayField) -> Trainer:
             mesh=model.mesh,
         )
 
-    later = call_of(config.rays_per_pixel)
-    num_first = train.one_ray_share * train.num_steps
-    if config.rays_per_pixel == 1 or num_first == 0:
-        call = later
-    else:
-        first = call_of(1)
+    call = later = call_of(config.rays_per_pixel)
+    if config.rays_per_pixel > 1:
+        first, num_first = call_of(1), train.one_ray_share * train.num_steps
 
         def call(key, state, table, is_training_view):
             this = first if int(state.step) < num_first else later

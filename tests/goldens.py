@@ -13,34 +13,20 @@ import sys
 import tempfile
 
 from bavs_jax.selection.policies import POLICIES
-from tests.toy_runs import toy_flags
+from tests.toy_runs import SMALL_NETWORKS, toy_flags
 
 ROOT = pathlib.Path(__file__).parents[1]
-SMALL_NETWORKS = {
-    "nerf_mlp__depth": 2,
-    "nerf_mlp__width": 16,
-    "nerf_mlp__skip": 1,
-    "mip_mlp__depth": 2,
-    "mip_mlp__width": 16,
-    "mip_mlp__proposal_width": 8,
-    "coarse_to_fine__num_coarse": 8,
-    "coarse_to_fine__num_fine": 8,
-    "proposal__num_proposals": "(12,8)",
-    "proposal__num_samples": 8,
-    "proposal__log2_table_size": 10,
-    "proposal__num_levels": 1,
-    "num_rounds": 1,
-}
+SMALL = {**SMALL_NETWORKS, "num_rounds": 1}
 CASES = {
     "all policies": {"policies": repr(tuple(POLICIES))},
-    "proposals": {"sampler_kind": "proposal", **SMALL_NETWORKS},
-    "nerf_mlp": {"field_kind": "nerf_mlp", **SMALL_NETWORKS},
+    "proposals": {"sampler_kind": "proposal", **SMALL},
+    "nerf_mlp": {"field_kind": "nerf_mlp", **SMALL},
     "nerf_mlp, proposals": {
         "field_kind": "nerf_mlp",
         "sampler_kind": "proposal",
-        **SMALL_NETWORKS,
+        **SMALL,
     },
-    "mip_mlp": {"field_kind": "mip_mlp", **SMALL_NETWORKS},
+    "mip_mlp": {"field_kind": "mip_mlp", **SMALL},
     "poses on a hemisphere": {"candidates__source": "hemisphere", "num_rounds": 1},
     "training on": {"from_scratch": "False", "uncertainty__weighting": "residual_weighted"},
     "bayesrays": {

@@ -16,24 +16,13 @@ from experiments.build_trainer import KINDS, build_model, build_trainer
 from experiments.errors import ConfigError
 from tests.toy_fields import rays_through
 from tests.toy_rounds import run_round, silent, start
-from tests.toy_runs import toy_config
+from tests.toy_runs import SMALL_NETWORKS, toy_config
 from tests.toy_scenes import toy_scene
 from tests.traces import count_traces
 
 KEY = jax.random.key(0)
 TINY = {
-    "nerf_mlp__depth": 2,
-    "nerf_mlp__width": 16,
-    "nerf_mlp__skip": 1,
-    "mip_mlp__depth": 2,
-    "mip_mlp__width": 16,
-    "mip_mlp__proposal_width": 8,
-    "coarse_to_fine__num_coarse": 8,
-    "coarse_to_fine__num_fine": 8,
-    "proposal__num_proposals": (12, 8),
-    "proposal__num_samples": 8,
-    "proposal__log2_table_size": 10,
-    "proposal__num_levels": 1,
+    **SMALL_NETWORKS,
     "hash_grid__num_levels": 1,
     "train__num_rays": 128,
     "train__num_steps": 160,

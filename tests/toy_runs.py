@@ -36,6 +36,22 @@ OVERRIDES = {
     "flow_training.num_draws": 2,
 }
 
+# Networks and samplers of other kinds, made tiny; overrides of `toy_config`.
+SMALL_NETWORKS = {
+    "nerf_mlp__depth": 2,
+    "nerf_mlp__width": 16,
+    "nerf_mlp__skip": 1,
+    "mip_mlp__depth": 2,
+    "mip_mlp__width": 16,
+    "mip_mlp__proposal_width": 8,
+    "coarse_to_fine__num_coarse": 8,
+    "coarse_to_fine__num_fine": 8,
+    "proposal__num_proposals": (12, 8),
+    "proposal__num_samples": 8,
+    "proposal__log2_table_size": 10,
+    "proposal__num_levels": 1,
+}
+
 
 def toy_config(**overrides):
     """The quickstart config made tiny; overrides are given with `__` for a dot."""

@@ -136,8 +136,8 @@ class RayField:
                 least=LEAST_LIGHT,
             )
 
-        spread = (False, True, True)
-        return over_rays(visible, self.mesh, sharded=spread)(field_params, rays, samples)
+        sharded = (False, True, True)
+        return over_rays(visible, self.mesh, sharded=sharded)(field_params, rays, samples)
 
     def refresh(self, key, state: ModelState, step) -> ModelState:
         density_fn = partial(self.field.density, state.params["field"])

@@ -186,8 +186,8 @@ def make_curvature_fn(
 
     @partial(jax.jit, static_argnames="bucket", donate_argnums=0)
     def add_chunk(totals, *args, bucket):
-        spread = (True, False, True)
-        return over_rays(partial(add_part, bucket=bucket), mesh, sharded=spread)(totals, *args)
+        sharded = (True, False, True)
+        return over_rays(partial(add_part, bucket=bucket), mesh, sharded=sharded)(totals, *args)
 
     @partial(jax.jit, static_argnames="num_groups")
     def fresh_totals(num_groups):

@@ -14,8 +14,8 @@ def make_fns(setup: SceneSetup) -> ModelFns:
     """Renders of the training views are fitted."""
     images = make_image_fn(setup, setup.kind)
 
-    spread = (True, True, True, True, False)
-    disagreement = jit_over_rays(warp_disagreement, setup.mesh, sharded=spread)
+    sharded = (True, True, True, True, False)
+    disagreement = jit_over_rays(warp_disagreement, setup.mesh, sharded=sharded)
 
     def fit(key, acquired):
         del key
