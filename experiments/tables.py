@@ -15,7 +15,6 @@ from __future__ import annotations
 import pathlib
 import re
 import sys
-from collections.abc import Sequence
 
 from absl import flags
 
@@ -29,8 +28,8 @@ FLAGS = flags.FLAGS
 flags.DEFINE_string("workdir", None, "Folder of an experiment or of a sweep: print its tables.")
 flags.DEFINE_string("page", None, "Markdown file whose tables are written anew.")
 flags.DEFINE_enum("format", "markdown", [*FORMATS], "Of what --workdir prints.")
-flags.DEFINE_list("tables", None, "Which tables, such as quality,rounds; all by default.")
-flags.DEFINE_list("policies", None, "Whose rows, in this order; by default all.")
+flags.DEFINE_list("tables", [], "Which tables, such as quality,rounds; all by default.")
+flags.DEFINE_list("policies", [], "Whose rows, in this order; by default all.")
 flags.DEFINE_string("paper", None, "Table of the paper to put beside ours, such as table_1.")
 
 MARKED = re.compile(
@@ -39,29 +38,24 @@ MARKED = re.compile(
 
 
 def result_tables(
-    folder: pathlib.Path,
-    *,
-    form: str = "markdown",
-    names: list[str] | None = None,
-    paper: str | None = None,
-    only: Sequence[str] = (),
+    folder: pathlib.Path, *, form: str = "markdown", names=(), paper: str | None = None, only=()
 ) -> str:
     """The tables of all result files of a folder, with the commands that made them.
 
     Args:
       folder: where the result files are.
       form: a key of `FORMATS`.
-      names: of the tables; None: all.
-      paper, only: a table of the paper, and the policies that are shown; see `experiment_tables`.
+      names: of the tables; none: all.
+      paper, only: a table of the paper, and the policies that are shown; see `collect_tables`.
 
     Raises:
       ReportError: a file that cannot be used, or no such table.
     """
     found = collect_all(folder, paper, only)
     known = list(dict.fromkeys(name for one in found for name in one.tables))
-    unknown = [name for name in names or () if name not in known]
-    if unknown:
-        raise ReportError(f"{folder}: no table {unknown[0]}; there are {', '.join(known)}")
+    for name in names:
+        if name not in known:
+            raise ReportError(f"{folder}: no table {name}; there are {', '.join(known)}")
     return "\n".join(collected_text(one, form=form, names=names) for one in found)
 
 
@@ -71,14 +65,12 @@ def fill_page(text: str, root: pathlib.Path) -> str:
     def filled(match: re.Match) -> str:
         head, folder, options, end = match.groups()
         given = dict(option.split("=", 1) for option in options.split())
-        names, only = (given.pop(name, "").split(",") for name in ("tables", "policies"))
+        lists = [given.pop(key, "") for key in ("tables", "policies")]
+        names, only = (text.split(",") if text else [] for text in lists)
         paper = given.pop("paper", None)
-        if given:
-            raise ReportError(
-                f"results: {folder}: {next(iter(given))}= is not tables=, policies= or paper="
-            )
-        shown = {"names": list(filter(None, names)), "only": list(filter(None, only))}
-        return f"{head}{result_tables(root / folder, paper=paper, **shown)}{end}"
+        for key in given:
+            raise ReportError(f"results: {folder}: {key}= is not tables=, policies= or paper=")
+        return f"{head}{result_tables(root / folder, names=names, paper=paper, only=only)}{end}"
 
     return MARKED.sub(filled, text)
 
@@ -88,7 +80,7 @@ def main() -> None:
         sys.exit("error: give either --workdir or --page")
     if FLAGS.workdir:
         folder = runtime.given_folder("workdir", "the folder of an experiment", exists=True)
-        options = {"names": FLAGS.tables, "paper": FLAGS.paper, "only": FLAGS.policies or ()}
+        options = {"names": FLAGS.tables, "paper": FLAGS.paper, "only": FLAGS.policies}
         print(result_tables(folder, form=FLAGS.format, **options))
         return
     page = pathlib.Path(FLAGS.page)

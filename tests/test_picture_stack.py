@@ -46,10 +46,13 @@ def test_a_report_shows_each_view_at_its_own_size(scene, tmp_path):
         for name in ("error", "uncertainty", "depth"):
             assert found[name][i].shape == shape[:2]
             assert (found[name][i] > 0.0).any()
-    strips = pictures.strips(found, pictures.uncertainty_limits([found]), max_side=100)
+    figure = pictures.views_figure({"bavs": found}, 3, errors=True)
+    titles = [axes.get_title("center") for axes in figure.axes if axes.images]
     words = pictures.psnr_words(found["rgb"][1], scene.image(3))
-    assert list(strips) == [scene.names[view] for view in VIEWS]
-    assert words in strips[scene.names[3]][1].caption
+    assert f"bavs, {words}" in titles
+    shapes = [axes.images[0].get_array().shape[:2] for axes in figure.axes if axes.images]
+    # A row has a truth, a render, an error and an uncertainty.
+    assert shapes == [scene.image(view).shape[:2] for view in VIEWS for _ in range(4)]
 
 
 def test_the_page_of_uncertainties_shows_each_view_at_its_own_size(scene):

@@ -13,7 +13,7 @@ from scipy import stats as scipy_stats
 from experiments.errors import ReportError
 from experiments.reporting import camera_map, pictures, plots, run_tables, stats
 from experiments.reporting.report import make_headline, write_report
-from experiments.reporting.results import load_runs, make_rounds
+from experiments.reporting.results import load_runs
 from tests import report_files
 
 
@@ -73,16 +73,13 @@ def test_headline_has_the_numbers_of_summary_json(full_workdir, full_page):
         )
         for policy in ("bavs", "random", "farthest")
     }
-    gaps = final["bavs"] - final["random"]
-    half = scipy_stats.t.ppf(0.975, 2) * gaps.std(ddof=1) / np.sqrt(3)
     words = _words(full_page)
-    expected = (
-        f"With 8 views, bavs reached {final['bavs'].mean():.2f} dB and random "
-        f"{final['random'].mean():.2f} dB: {gaps.mean():+.2f} dB (95 % interval "
-        f"{gaps.mean() - half:+.2f} to {gaps.mean() + half:+.2f} dB over 3 seeds)."
-    )
-    assert expected.replace("-", "−") in words
-    assert f"Against farthest ({final['farthest'].mean():.2f} dB)" in words
+    assert f"With 8 views, bavs reached a PSNR of {final['bavs'].mean():.2f} ± " in words
+    for reference in ("random", "farthest"):
+        gaps = final["bavs"] - final[reference]
+        half = scipy_stats.t.ppf(0.975, 2) * gaps.std(ddof=1) / np.sqrt(3)
+        expected = f"{gaps.mean():+.2f} ± {half:.2f} (p".replace("-", "−")
+        assert re.search(rf"{re.escape(expected)} [=<] [0-9.]+\) against {reference}", words)
 
 
 def test_missing_lpips_is_a_dash_with_its_reason(full_page):
@@ -99,7 +96,7 @@ def test_all_sections_are_there(full_page):
 
 
 def test_of_many_policies_the_few_that_matter_have_a_colour(tmp_path):
-    names = ["bavs", "random", "farthest", *(f"rival_{i}" for i in range(7))]
+    names = [*(f"rival_{i}" for i in range(7)), "farthest", "random", "bavs"]
     results = []
     for place, name in enumerate(names):
         for seed in (0, 1):
@@ -107,15 +104,14 @@ def test_of_many_policies_the_few_that_matter_have_a_colour(tmp_path):
             result["rounds"][-1]["psnr"] = 20.0 + place + 0.1 * seed
             results.append(result)
     runs = load_runs(report_files.write_workdir(tmp_path, results, arrays=False))
-    coloured = plots.in_colour(runs, names, "bavs")
-    assert coloured == ["bavs", "random", "farthest", "rival_6", "rival_5"]
-    assert plots.in_colour(runs, names[:7], "bavs") == names[:7]
-    num_views = stats.common_num_views(runs)
-    found = stats.compare(runs, "farthest", "random", "psnr", num_views).gaps
-    np.testing.assert_allclose(found, [1.0, 1.0])
-    words = _words(_page(tmp_path))
-    assert "the means of the 5 other policies" in words
-    assert "3 more policies are in the table" in words
+    policies = plots.by_interest(names)
+    assert policies == ["bavs", "random", "farthest", *names[:7]]
+    (axes,) = plots.quality_figure(runs, policies, stats.MEASURES[0]).axes
+    _, labels = axes.get_legend_handles_labels()
+    assert labels == policies[:7]
+    gap = stats.paired_gap(*(stats.by_seed(runs, name) for name in ("bavs", "random")))
+    np.testing.assert_allclose(gap[:2], [1.0, 0.0], atol=1e-12)
+    assert "Grey: the means of the other policies" in _words(_page(tmp_path))
 
 
 def test_the_gap_over_rounds_is_paired_and_leaves_the_initial_views_out(full_workdir):
@@ -129,15 +125,14 @@ def test_the_gap_over_rounds_is_paired_and_leaves_the_initial_views_out(full_wor
             if (run.policy, run.seed) == (name, seed)
         )
         by_hand.append(ours - theirs)
-    gap = stats.mean_round_gap(runs, "bavs", "farthest", "psnr")
     half = scipy_stats.t.ppf(0.975, 2) * np.std(by_hand, ddof=1) / np.sqrt(3)
-    np.testing.assert_allclose([gap.mean, gap.half], [np.mean(by_hand), half])
     table = run_tables.rounds_table(runs, ["random", "farthest", "bavs"])
     assert table.head[1:3] == ("PSNR at 6 views (dB)", "PSNR at 8 views (dB)")
+    cell = table.rows[2][-1]
+    np.testing.assert_allclose(cell.interval[:2], [np.mean(by_hand), half])
     p_value = scipy_stats.ttest_1samp(by_hand, 0.0).pvalue
-    expected = f"{gap.mean:+.2f} ± {gap.half:.2f} (p = {p_value:.2g})".replace("-", "−")
-    assert table.rows[2][-1].text == expected
-    assert stats.mean_round_gap(runs, "bavs", "oracle", "psnr") is None
+    expected = f"{np.mean(by_hand):+.2f} ± {half:.2f} (p = {p_value:.2g})".replace("-", "−")
+    assert cell.text == expected
 
 
 # --- words -----------------------------------------------------------------------------------
@@ -145,8 +140,8 @@ def test_the_gap_over_rounds_is_paired_and_leaves_the_initial_views_out(full_wor
 
 def test_one_seed_is_said_to_prove_little(tmp_path):
     headline = _headline(tmp_path, [report_files.make_result(p) for p in ("bavs", "random")])
-    assert "one seed" in headline.result
-    assert "One seed proves little" in headline.verdict
+    assert "±" not in headline[0]
+    assert "One seed proves little" in headline[1]
 
 
 def test_a_loss_is_called_a_loss(tmp_path):
@@ -156,22 +151,15 @@ def test_a_loss_is_called_a_loss(tmp_path):
         for seed in range(3)
     ]
     headline = _headline(tmp_path, results)
-    assert "−" in headline.result
-    assert "bavs lost" in headline.verdict
-    assert "excludes zero" in headline.verdict
+    assert "−" in headline[0]
+    assert "worse than random" in headline[1] and "excludes zero" in headline[1]
 
 
 def test_an_interval_with_zero_is_no_clear_difference(tmp_path):
     results = [report_files.make_result(p, s) for p in ("bavs", "random") for s in range(3)]
     for result, gap in zip(results, [0.5, -0.4, 0.3, 0.0, 0.0, 0.0]):
         result["rounds"][-1]["psnr"] = 25.0 + gap
-    assert "no clear difference" in _headline(tmp_path, results).verdict
-
-
-def test_views_saved_are_read_off_the_mean_curve():
-    curve = [(4, stats.Interval(20.0, None, 1)), (8, stats.Interval(24.0, None, 1))]
-    np.testing.assert_allclose(stats.views_to_reach(curve, 23.0), 7.0)
-    assert stats.views_to_reach(curve, 24.1) is None
+    assert "no clear difference" in _headline(tmp_path, results)[1]
 
 
 # --- degenerate folders ----------------------------------------------------------------------
@@ -180,8 +168,8 @@ def test_views_saved_are_read_off_the_mean_curve():
 def test_one_policy_with_one_seed_and_no_pictures(tmp_path):
     workdir = report_files.write_workdir(tmp_path, [report_files.make_result("bavs")], arrays=False)
     words = _words(_page(workdir))
-    assert "Only one policy was run" in words
-    assert "has no pictures.npz yet" in words
+    assert "nothing to compare it with: add random to config.policies" in words
+    assert "No pictures: no run of bavs has any" in words
     assert "has no acquisition.npz yet" in words
 
 
@@ -191,9 +179,9 @@ def test_incomplete_runs_are_named_and_left_out_of_means(tmp_path):
     results[1]["rounds"] = results[1]["rounds"][:2]
     workdir = report_files.write_workdir(tmp_path, results, arrays=False)
     runs = load_runs(workdir)
-    final = stats.over_seeds(runs, "bavs", "psnr", 12)
-    assert final == stats.Interval(results[0]["rounds"][-1]["psnr"], None, 1)
-    assert stats.compare(runs, "bavs", "random", "psnr", 12).gap.num == 1
+    ours, theirs = (stats.by_seed(runs, name) for name in ("bavs", "random"))
+    assert ours == {0: results[0]["rounds"][-1]["psnr"]}
+    assert stats.paired_gap(ours, theirs).num == 1
     assert "left out of all means: bavs, seed 1." in _words(_page(workdir))
 
 
@@ -203,7 +191,7 @@ def test_runs_that_chose_nothing(tmp_path, rounds_left):
     result["rounds"] = result["rounds"][:rounds_left]
     words = _words(_page(report_files.write_workdir(tmp_path, [result])))
     assert "There is no result yet." in words
-    assert "No view has been chosen beyond the initial ones." in words
+    assert "no view has been chosen beyond the initial ones" in words
 
 
 def test_no_run_at_all(tmp_path):
@@ -215,7 +203,7 @@ def test_null_and_nan_measures_do_not_reach_the_page(tmp_path):
     for one in results[0]["rounds"]:
         one["psnr"], one["depth_mae"] = None, float("nan")
     page = _page(report_files.write_workdir(tmp_path, results, arrays=False))
-    assert "bavs has no PSNR" in _words(page)
+    assert "bavs reached a PSNR of — dB" in _words(page)
     assert "PSNR: not measured" in _words(page)
     assert "not a finite number" in _words(page)
     assert not re.search(r">[^<]*\bnan\b", page)
@@ -256,7 +244,8 @@ def test_mean_interval_agrees_with_scipy():
     values = np.array([24.1, 25.3, 24.7, 26.0])
     interval = stats.mean_interval(values)
     expected = scipy_stats.t.interval(0.95, 3, values.mean(), scipy_stats.sem(values))
-    np.testing.assert_allclose([interval.low, interval.high], expected, rtol=1e-12)
+    found = [interval.mean - interval.half, interval.mean + interval.half]
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
     assert stats.mean_interval([]) is None
 
 
@@ -265,8 +254,8 @@ def test_gap_is_paired_so_the_luck_of_a_seed_cancels(tmp_path):
     for result, level in zip(results, [21.0, 25.0, 29.0, 20.0, 24.0, 28.0]):
         result["rounds"][-1]["psnr"] = level
     runs = load_runs(report_files.write_workdir(tmp_path, results, arrays=False))
-    gap = stats.compare(runs, "bavs", "random", "psnr", 12).gap
-    np.testing.assert_allclose([gap.mean, gap.half], [1.0, 0.0], atol=1e-12)
+    gap = stats.paired_gap(*(stats.by_seed(runs, name) for name in ("bavs", "random")))
+    np.testing.assert_allclose(gap[:2], [1.0, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (1, 0, 0), (1, 2, -3)])
@@ -289,27 +278,19 @@ def test_projection_is_seen_from_above():
     np.testing.assert_allclose(points, np.sqrt(2.0) * np.eye(2), atol=1e-12)
 
 
-def test_rounds_replay_candidates_ranks_and_distances():
+def test_choices_are_named_with_their_scores_and_what_the_run_knows_of_them(tmp_path):
+    result = report_files.make_result("bavs", num_rounds=2)
+    workdir = report_files.write_workdir(tmp_path, [result], arrays=False)
     nan = np.nan
     acquisition = {
-        "positions": np.array([[0, 0, 1], [3, 0, 1], [0, 4, 1], [0, 9, 1], [5, 0, 1]], float),
-        "up": np.array([0.0, 0.0, 1.0]),
-        "centre": np.zeros(3),
-        "pool": np.arange(5),
-        "initial": np.array([0]),
-        "scores": np.array([[nan, 0.9, 0.5, 0.7, 0.1], [nan, nan, nan, 0.2, 0.6]]),
-        "survivors": np.array([[1, 0, 1, 1, 1], [1, 1, 1, 1, 1]], bool),
+        "positions": np.zeros((5, 3)),
+        "scores": np.array([[nan, 0.9, 0.5, 0.7, 0.1], [nan, nan, nan, 0.2, nan]]),
         "selected": np.array([[3, 2], [4, -1]]),
     }
-    first, second = make_rounds(acquisition)
-    one, two = ([c.text for c in row] for row in run_tables.choice_table(first).rows)
-    assert one == ["view 3", "0.7", "2 of 4", "1 of 3", "9"]
-    assert two == ["view 2", "0.5", "3 of 4", "2 of 3", "4"]
-    np.testing.assert_allclose(first.distances, [9.0, 4.0])
-    assert list(second.candidates) == [1, 4]
-    (row,) = run_tables.choice_table(second).rows
-    assert [cell.text for cell in row[:3]] == ["view 4", "0.6", "1 of 1"]
-    np.testing.assert_allclose(second.distances, [5.0])  # view 1, at 2, was never held
+    table = run_tables.choices_table(load_runs(workdir)[0], acquisition)
+    assert [row[0].text for row in table.rows] == ["1", "2"]
+    assert [row[-1].text for row in table.rows] == ["view 3 (0.7), view 2 (0.5)", "view 4"]
+    assert [cell.text for cell in table.rows[0][1:-1]] == ["—", "35", "1", "—"]
 
 
 @pytest.mark.parametrize("capture", ["orbit of many distances", "forward facing", "in the centre"])
@@ -324,8 +305,7 @@ def test_maps_of_captures_that_are_no_orbit(capture):
     else:
         offsets[17] = 0.0
     acquisition["positions"] = acquisition["centre"] + offsets
-    rounds = make_rounds(acquisition)
-    svg = camera_map.map_plot(acquisition, rounds, salt="test")
+    svg = camera_map.map_plot(acquisition, salt="test")
     assert svg.startswith("<svg ")
     assert "nan" not in svg
 

@@ -11,9 +11,8 @@ from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 
 from experiments.reporting import plots
 from experiments.reporting.page import Section, write_page
-from experiments.reporting.plots import seconds
 from experiments.reporting.results import read_result
-from experiments.reporting.tables import Cell, Collected, Table, dash
+from experiments.reporting.tables import Cell, Collected, Table, dash, seconds
 
 BENCHMARK, QUALITY = "benchmark.json", "time_to_quality.json"
 STAGES = {

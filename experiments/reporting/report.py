@@ -5,25 +5,19 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import NamedTuple
 
-from experiments.reporting import camera_map, pictures, plots, run_tables, stats
+from experiments.reporting import pictures, plots, run_tables, stats
+from experiments.reporting.camera_map import map_plot
 from experiments.reporting.page import FOLDER, write_template
 from experiments.reporting.results import (
     Run,
-    bound_words,
     load_acquisition,
-    load_pictures,
     load_runs,
-    make_rounds,
     policies_of,
 )
-from experiments.reporting.stats import REFERENCES
-from experiments.reporting.tables import signed
+from experiments.reporting.stats import MEASURES, REFERENCES
+from experiments.reporting.tables import interval_cell
 
-# The first seed of each policy is shown at full size, the others folded away and smaller.
-MAX_SIDE, MAX_SIDE_FOLDED = 320, 160  # pixels
-MOST_COMPARED = 6  # policies that the headline names
 SEED_SPREAD = (
     "One seed proves little: the spread between seeds is often half a dB, as large as most gains. "
     "Run at least 5 seeds before drawing a conclusion."
@@ -44,170 +38,92 @@ def write_report(workdir: str | os.PathLike) -> Path:
       ReportError: a file is missing, broken or of another schema version.
     """
     runs = load_runs(Path(workdir))
-    focus = stats.focus_policy(policies_of(runs))
-    # In the order of the file, but ours first: it gets the first colour.
-    policies = sorted(policies_of(runs), key=lambda p: p != focus)
-    by_policy = {p: [run for run in runs if run.policy == p] for p in policies}
-    by_policy = {p: sorted(some, key=lambda run: run.seed) for p, some in by_policy.items()}
-    coloured = plots.in_colour(runs, policies, focus)
-    num_views = stats.common_num_views(runs)
-    finals = {p: stats.over_seeds(runs, p, "psnr", num_views) for p in coloured}
-    colours = plots.policy_style(coloured)
-    qualities, missing = [], []
-    for measure in stats.MEASURES:
-        figure = plots.quality_figure(runs, policies, measure, coloured)
+    policies = plots.by_interest(policies_of(runs))
+    runs = sorted(runs, key=lambda run: (policies.index(run.policy), run.seed))
+    curves, missing = [], []
+    for measure in MEASURES:
+        figure = plots.quality_figure(runs, policies, measure)
         if figure is not None:
             label = f"{measure.label} against training views"
-            qualities.append(plots.to_svg(figure, salt=f"quality-{measure.key}", label=label))
+            curves.append(plots.to_svg(figure, salt=f"quality-{measure.key}", label=label))
         elif runs:
             missing.append(run_tables.missing_measure(measure, runs))
-    limits, strips = _strips(by_policy)
     configs: dict[str, list[str]] = {}
-    versions: dict[str, set[str]] = {}
     for run in runs:
-        text = json.dumps(run.result.get("config", {}), indent=2, sort_keys=True)
+        made = {key: run.result.get(key) for key in ("versions", "config")}
+        text = json.dumps(made, indent=2, sort_keys=True)
         configs.setdefault(text, []).append(run.label)
-        for package, version in run.result.get("versions", {}).items():
-            versions.setdefault(package, set()).add(str(version))
     path = Path(workdir) / "report.html"
     write_template(
         path,
         FOLDER / "report.html",
         runs=runs,
         policies=policies,
-        by_policy=by_policy,
-        num_views=[r["num_views"] for run in runs for r in run.rounds],
-        num_seeds=len({run.seed for run in runs}),
         headline=make_headline(runs, policies),
-        tiles=[(p, colours[p][0], psnr) for p, psnr in finals.items() if psnr is not None],
-        num_grey=len(policies) - len(coloured),
-        gaps=plots.gap_plot(runs, policies, coloured),
-        incomplete=[run.label for run in runs if not run.completed],
-        qualities=qualities,
+        finals={p: stats.mean_interval(stats.by_seed(runs, p)) for p in policies[: plots.MANY]},
+        colours=plots.policy_style(policies),
+        curves=curves,
         missing=missing,
         final=run_tables.final_table(runs, policies),
         by_round=run_tables.rounds_table(runs, policies),
-        all_runs=run_tables.runs_table(runs),
-        strips=strips,
-        bars=pictures.colour_bars(limits) if strips else [],
-        maps=_maps(by_policy),
-        bound_words=bound_words,
-        timing=plots.timing_plot(runs, policies),
-        timing_table=run_tables.timing_table(runs, policies),
-        versions=versions,
+        strips=_strips(runs),
+        maps=_maps(runs),
+        timing=run_tables.timing_table(runs, policies),
         configs=configs,
     )
     return path
 
 
-def _strips(by_policy: dict[str, list[Run]]) -> tuple[tuple[float, float], dict]:
-    """The scale of all uncertainties, and by run its round and the pictures of each view."""
-    found = {run.label: load_pictures(run) for some in by_policy.values() for run in some}
-    found = {label: arrays for label, arrays in found.items() if arrays is not None}
-    limits = pictures.uncertainty_limits([*found.values()])
-    large = {some[0].label for some in by_policy.values()}
+def _strips(runs: list[Run]) -> dict[str, tuple]:
+    """By policy, of its first run that has some: label, round, and its test views."""
+    found = pictures.first_pictures(runs)
+    limits = pictures.uncertainty_limits([arrays for _, arrays in found.values()])
     strips = {}
-    for label, arrays in found.items():
-        side = MAX_SIDE if label in large else MAX_SIDE_FOLDED
-        strips[label] = int(arrays["round"]), pictures.strips(arrays, limits, max_side=side)
-    return limits, strips
+    for number, (policy, (run, arrays)) in enumerate(found.items()):
+        if len(arrays["view_ids"]):
+            shown = {policy: arrays}
+            figure = pictures.views_figure(shown, pictures.MAX_VIEWS, limits, errors=True)
+            words = f"Test views of {run.label}"
+            svg = plots.to_svg(figure, salt=f"views{number}", label=words)
+            strips[policy] = run.label, int(arrays["round"]), svg
+    return strips
 
 
-def _maps(by_policy: dict[str, list[Run]]) -> dict[str, tuple]:
-    """By run, the maps of its rounds, and each round with the table of its choices."""
+def _maps(runs: list[Run]) -> dict[str, tuple]:
+    """By run, the maps of its rounds and the table of its choices."""
     maps = {}
-    for number, some in enumerate(by_policy.values()):
-        for place, run in enumerate(some):
-            acquisition = load_acquisition(run)
-            if acquisition is not None:
-                rounds = make_rounds(acquisition)
-                svg = camera_map.map_plot(acquisition, rounds, salt=f"map{number}-{place}")
-                tables = [(one, run_tables.choice_table(one)) for one in rounds]
-                maps[run.label] = svg, tables
+    for number, run in enumerate(runs):
+        if (arrays := load_acquisition(run)) is not None:
+            svg = map_plot(arrays, salt=f"map{number}")
+            maps[run.label] = svg, run_tables.choices_table(run, arrays)
     return maps
 
 
-# --- the result in plain words ---
-
-
-class Headline(NamedTuple):
-    """What stands at the top of the page."""
-
-    result: str
-    verdict: str
-    more: tuple[str, ...] = ()
-
-
-def decibels(value: float, *, gap: bool = False) -> str:
-    """A level, or a gap with its sign, that is never broken before its unit."""
-    return f"{signed(value) if gap else f'{value:.2f}'}\u00a0dB"
-
-
-def make_headline(runs: list[Run], policies: list[str]) -> Headline:
-    """Says what came out, for better or worse."""
-    num_views = stats.common_num_views(runs)
-    done = [p for p in policies if stats.completed(runs, p)]
-    focus = stats.focus_policy(done)
-    if focus is None or num_views is None:
-        return Headline("There is no result yet.", "No run has been completed so far.")
-    # Ours leads the sentence; then random and farthest-view, then whatever else there is.
-    others = [p for p in REFERENCES if p in done] + [p for p in done if p not in REFERENCES]
-    pairs = [(p, stats.compare(runs, focus, p, "psnr", num_views)) for p in others if p != focus]
-    pairs = [(p, comparison) for p, comparison in pairs if comparison is not None]
-    if not pairs:
-        return _single_headline(runs, focus, num_views, len(done) > 1)
-    reference, first = pairs[0]
-    result = (
-        f"With {num_views} views, {focus} reached {decibels(first.policy.mean)} and "
-        f"{reference} {decibels(first.reference.mean)}: {_gap_words(first.gap)}."
-    )
-    more = [
-        f"Against {p} ({decibels(c.reference.mean)}): {_gap_words(c.gap)}."
-        for p, c in pairs[1:MOST_COMPARED]
+def make_headline(runs: list[Run], policies: list[str]) -> tuple[str, str]:
+    """What came out, and what that proves, for better or worse."""
+    done = plots.by_interest(p for p in policies if stats.completed(runs, p))
+    num_views = max(stats.shared_num_views(runs), default=None)
+    if num_views is None:
+        return "There is no result yet.", "No run has been completed so far."
+    focus, *others = done
+    level = interval_cell(stats.mean_interval(stats.by_seed(runs, focus)), 2, "")
+    result = f"With {num_views} views, {focus} reached a PSNR of {level.text} dB"
+    gaps = {p: stats.paired_gap(stats.by_seed(runs, focus), stats.by_seed(runs, p)) for p in others}
+    # Random and farthest-view first, then whatever else there is.
+    gaps = {p: gaps[p] for p in [*REFERENCES, *others] if gaps.get(p) is not None}
+    if not gaps:
+        verdict = "No seed has two policies, so there is nothing to compare it with: add random"
+        return f"{result}.", f"{verdict} to config.policies."
+    words = [
+        f"{interval_cell(gap, 2, '', gap=True).text} against {p}"
+        for p, gap in list(gaps.items())[: len(REFERENCES)]
     ]
-    if len(pairs) > MOST_COMPARED:
-        more.append(f"{len(pairs) - MOST_COMPARED} more policies are in the table below.")
-    target = stats.over_seeds(runs, reference, "psnr", num_views).mean
-    needed = stats.views_to_reach(stats.mean_curve(runs, focus, "psnr"), target)
-    if needed is not None and needed < num_views:
-        more.append(
-            f"{focus} needed about {needed:.1f} views to reach the {decibels(target)} that "
-            f"{reference} has with {num_views}."
-        )
-    return Headline(result, _verdict_words(first.gap, focus, reference), tuple(more))
-
-
-def _gap_words(gap: stats.Interval) -> str:
+    (reference, gap), *_ = gaps.items()
+    verdict = f"Here {focus} is {'better' if gap.mean > 0.0 else 'worse'} than {reference}"
     if gap.half is None:
-        return f"{decibels(gap.mean, gap=True)} (one seed, no interval)"
-    return (
-        f"{decibels(gap.mean, gap=True)} (95\u00a0% interval {signed(gap.low)} to "
-        f"{decibels(gap.high, gap=True)} over {gap.num} seeds)"
-    )
-
-
-def _verdict_words(gap: stats.Interval, focus: str, reference: str) -> str:
-    if round(gap.mean, 2) == 0.0:
-        sides = f"Here {focus} and {reference} came out level"
-    elif gap.mean > 0.0:
-        sides = f"Here {focus} did better than {reference}"
+        verdict = f"{verdict}. {SEED_SPREAD}"
+    elif abs(gap.mean) <= gap.half:
+        verdict += " on average, but the interval includes zero: no clear difference."
     else:
-        sides = f"Here {focus} lost: it did worse than {reference}"
-    if gap.half is None:
-        return f"{sides}. {SEED_SPREAD}"
-    if gap.low <= 0.0 <= gap.high:
-        return f"{sides} on average, but the interval includes zero: no clear difference."
-    return f"{sides}, and the interval excludes zero."
-
-
-def _single_headline(runs: list[Run], focus: str, num_views: int, unpaired: bool) -> Headline:
-    """Result and verdict where there is nothing to compare with."""
-    why = "No seed has two policies" if unpaired else "Only one policy was run"
-    verdict = f"{why}, so there is nothing to compare it with; add random to config.policies."
-    interval = stats.over_seeds(runs, focus, "psnr", num_views)
-    if interval is None:
-        return Headline(f"With {num_views} views, {focus} has no PSNR.", verdict)
-    reached = f"With {num_views} views, {focus} reached {decibels(interval.mean)}"
-    if interval.half is None:
-        return Headline(f"{reached}.", f"{verdict} {SEED_SPREAD}")
-    return Headline(f"{reached} (± {decibels(interval.half)}, {interval.num} seeds).", verdict)
+        verdict += ", and the interval excludes zero."
+    return f"{result}: {', '.join(words)}.", verdict

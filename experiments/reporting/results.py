@@ -31,7 +31,7 @@ class Run:
     result: dict  # the whole of result.json
     folder: Path  # where its pictures.npz and acquisition.npz are, if it has them
 
-    def value(self, measure: str, num_views: int) -> float | None:
+    def value(self, measure: str, num_views: int | None) -> float | None:
         """A measure at the last round with so many views; None if not measured or not finite."""
         values = [r.get(measure) for r in self.rounds if r["num_views"] == num_views]
         if not values or values[-1] is None or not np.isfinite(values[-1]):
@@ -49,24 +49,24 @@ def read_result(path: Path, version: int = SCHEMA_VERSION, made_by: str = "exper
     Raises:
       ReportError: the file is missing, broken or of another version.
     """
-    return read_versioned(
-        path,
-        version,
-        error=ReportError,
-        absent=f"give the --workdir of an {made_by}",
-        fix=f"run the {made_by} again",
-    )
+    absent, fix = f"give the --workdir of an {made_by}", f"run the {made_by} again"
+    return read_versioned(path, version, error=ReportError, absent=absent, fix=fix)
 
 
 def load_runs(workdir: Path, policies: Sequence[str] = ()) -> list[Run]:
-    """The runs of `summary.json`: all in its order, or those of some policies in their order.
+    """The runs of `summary.json`, policy by policy: of all, or of some in the order given.
 
     Raises:
       ReportError: the file is missing or broken, or holds runs of more than one scene; or a policy
         has no run.
     """
-    path = workdir / "summary.json"
-    runs = [_load_run(result, path) for result in read_result(path)["runs"]]
+    path, runs = workdir / "summary.json", []
+    for result in read_result(path)["runs"]:
+        if missing := [key for key in RUN_KEYS if key not in result]:
+            raise ReportError(f"{path}: a run lacks {', '.join(missing)}; run the experiment again")
+        policy, seed = result["policy"], int(result["seed"])
+        folder = workdir / policy / f"seed_{seed}"
+        runs.append(Run(policy, seed, result["completed"], result["rounds"], result, folder))
     scenes = sorted({run.result["scene"]["name"] for run in runs})
     if len(scenes) > 1:
         raise ReportError(f"{path}: scene differs ({', '.join(scenes)}); use one workdir per scene")
@@ -74,26 +74,12 @@ def load_runs(workdir: Path, policies: Sequence[str] = ()) -> list[Run]:
     for policy in policies:
         if policy not in known:
             raise ReportError(f"{workdir}: no run of {policy}; there are {', '.join(known)}")
-    return [run for policy in policies for run in runs if run.policy == policy] or runs
+    return [run for policy in policies or known for run in runs if run.policy == policy]
 
 
 def policies_of(runs: list[Run]) -> list[str]:
     """Each policy once, in the order of the runs."""
     return list(dict.fromkeys(run.policy for run in runs))
-
-
-def _load_run(result: dict, path: Path) -> Run:
-    missing = [key for key in RUN_KEYS if key not in result]
-    if missing:
-        raise ReportError(f"{path}: a run lacks {', '.join(missing)}; run the experiment again")
-    return Run(
-        policy=result["policy"],
-        seed=int(result["seed"]),
-        completed=bool(result["completed"]),
-        rounds=result["rounds"],
-        result=result,
-        folder=path.parent / result["policy"] / f"seed_{result['seed']}",
-    )
 
 
 def load_pictures(run: Run) -> dict[str, np.ndarray] | None:
@@ -114,54 +100,6 @@ def _load_arrays(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray] | N
         return None
     except ValueError as error:
         raise ReportError(f"{error}; run the experiment again, which makes it anew") from error
-
-
-# --- what was chosen ---
-
-
-@dataclasses.dataclass(frozen=True)
-class Round:
-    """One round of choosing; view ids are rows of `positions`."""
-
-    number: int  # from 1, as round 0 only trains on the initial views
-    candidates: np.ndarray  # [C] views that could have been chosen
-    survives: np.ndarray  # [C] bool, passed the distance filter
-    scores: np.ndarray  # [C], NaN where not scored
-    selected: np.ndarray  # [K] views, as the next three
-    names: list[str]
-    selected_scores: np.ndarray  # NaN where not scored
-    distances: np.ndarray  # to the nearest training view, scene units
-
-    @property
-    def is_scored(self) -> bool:
-        """Whether the policy gave any chosen view a score."""
-        return bool(np.isfinite(self.selected_scores).any())
-
-
-def make_rounds(acquisition: dict[str, np.ndarray]) -> list[Round]:
-    """Replays the rounds of one run from its `acquisition.npz`."""
-    positions = np.asarray(acquisition["positions"], float)
-    names = acquisition.get("names", [f"view {view}" for view in range(len(positions))])
-    training, rounds = np.asarray(acquisition["initial"], int), []
-    for i, selected in enumerate(np.asarray(acquisition["selected"], int)):
-        selected = selected[selected >= 0]  # -1 fills a round that chose fewer
-        candidates = np.setdiff1d(np.asarray(acquisition["pool"], int), training)
-        scores = np.asarray(acquisition["scores"][i], float)
-        gaps = np.linalg.norm(positions[selected][:, None] - positions[training], axis=-1)
-        rounds.append(
-            Round(
-                number=i + 1,
-                candidates=candidates,
-                survives=np.asarray(acquisition["survivors"][i], bool)[candidates],
-                scores=scores[candidates],
-                selected=selected,
-                names=[str(names[view]) for view in selected],
-                selected_scores=scores[selected],
-                distances=gaps.min(-1) if training.size else np.full(len(selected), np.nan),
-            )
-        )
-        training = np.concatenate([training, selected])
-    return rounds
 
 
 def bound_words(bound: dict) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import t as student_t
@@ -12,68 +13,48 @@ from experiments.errors import ReportError
 from experiments.reporting.results import Run
 
 
-@dataclasses.dataclass(frozen=True)
-class Measure:
+class Measure(NamedTuple):
     """How a measure is called and printed."""
 
     key: str
     label: str
-    unit: str  # empty where it has none
+    heading: str  # of a column, with the unit
     digits: int
     better: str  # "higher" or "lower"
 
-    @property
-    def heading(self) -> str:
-        """Of a column, with the unit."""
-        return f"{self.label} ({self.unit})" if self.unit else self.label
 
-    @property
-    def title(self) -> str:
-        return f"{self.heading}, {self.better} is better"
-
-
-REFERENCES = ("random", "farthest")  # what a policy must beat to be worth its time
+PSNR = Measure("psnr", "PSNR", "PSNR (dB)", 2, "higher")
 MEASURES = (
-    Measure("psnr", "PSNR", "dB", 2, "higher"),
-    Measure("ssim", "SSIM", "", 4, "higher"),
-    Measure("lpips", "LPIPS", "", 4, "lower"),
-    Measure("depth_mae", "Depth error", "scene units", 4, "lower"),
+    PSNR,
+    Measure("ssim", "SSIM", "SSIM", 4, "higher"),
+    Measure("lpips", "LPIPS", "LPIPS", 4, "lower"),
+    Measure("depth_mae", "Depth error", "Depth error (scene units)", 4, "lower"),
 )
+REFERENCES = ("random", "farthest")  # what a policy must beat to be worth its time
 
 
-@dataclasses.dataclass(frozen=True)
-class Interval:
+class Interval(NamedTuple):
     """A mean over seeds with its 95 % interval, `mean ± half`."""
 
     mean: float
     half: float | None  # None: one seed says nothing about the spread
     num: int
 
-    @property
-    def low(self) -> float | None:
-        return None if self.half is None else self.mean - self.half
 
-    @property
-    def high(self) -> float | None:
-        return None if self.half is None else self.mean + self.half
-
-
-def mean_interval(values) -> Interval | None:
+def mean_interval(values: Iterable[float] | dict[int, float]) -> Interval | None:
     """Mean and Student's t interval: `half = t_{0.975, n - 1} s / sqrt(n)`.
 
     Args:
-      values: one number per seed, or paired differences, one per seed.
+      values: numbers, or by seed numbers or paired differences.
 
     Returns:
       The interval, or None of no values.
     """
-    values = np.asarray(list(values), np.float64)
-    if values.size == 0:
-        return None
-    half = None
-    if values.size > 1:
-        half = student_t.ppf(0.975, values.size - 1) * values.std(ddof=1) / np.sqrt(values.size)
-    return Interval(float(values.mean()), None if half is None else float(half), values.size)
+    numbers = np.array([*(values.values() if isinstance(values, dict) else values)], np.float64)
+    if numbers.size < 2:
+        return Interval(float(numbers[0]), None, 1) if numbers.size else None
+    half = student_t.ppf(0.975, numbers.size - 1) * numbers.std(ddof=1) / np.sqrt(numbers.size)
+    return Interval(float(numbers.mean()), float(half), numbers.size)
 
 
 def paired_p_value(gap: Interval) -> float | None:
@@ -97,61 +78,12 @@ def paired_p_value(gap: Interval) -> float | None:
     return float(2.0 * student_t.sf(abs(gap.mean) / standard_error, gap.num - 1))
 
 
+# --- of runs ---
+
+
 def completed(runs: list[Run], policy: str | None = None) -> list[Run]:
     """Runs that ended and measured something, of one policy or of all."""
     return [r for r in runs if r.completed and r.rounds and policy in (None, r.policy)]
-
-
-def focus_policy(policies: list[str]) -> str | None:
-    """The policy that a report is about: ours where it ran, otherwise the first."""
-    ours = [p for p in policies if p == "bavs"] or [p for p in policies if p.startswith("bavs")]
-    return next(iter(ours or policies), None)
-
-
-def over_seeds(
-    runs: list[Run], policy: str, measure: str, num_views: int | None
-) -> Interval | None:
-    """Mean over the seeds of a policy."""
-    return mean_interval(by_seed(runs, policy, measure, num_views).values())
-
-
-@dataclasses.dataclass(frozen=True)
-class Comparison:
-    """One policy against another over the seeds both have."""
-
-    policy: Interval
-    reference: Interval
-    gap: Interval  # of the paired differences, policy - reference
-    gaps: list[float]  # the differences, seed by seed
-
-
-def compare(
-    runs: list[Run], policy: str, reference: str, measure: str, num_views: int | None
-) -> Comparison | None:
-    """Pairs the seeds of two policies: the initial views, and so their luck, are the same.
-
-    Returns:
-      The comparison, or None where no seed has both.
-    """
-    pairs = _pairs(runs, policy, reference, measure, num_views).values()
-    if not pairs:
-        return None
-    ours, theirs = zip(*pairs)
-    gaps = [a - b for a, b in pairs]
-    return Comparison(mean_interval(ours), mean_interval(theirs), mean_interval(gaps), gaps)
-
-
-def mean_round_gap(runs: list[Run], policy: str, reference: str, measure: str) -> Interval | None:
-    """Paired gap averaged over the rounds in which views had been chosen, one number per seed.
-
-    A field trained from few views differs from run to run by luck; the mean over rounds has less
-    of that than the last round alone, and it also counts what is gained early.
-    """
-    by_round = [_pairs(runs, policy, reference, measure, n) for n in chosen_num_views(runs)]
-    seeds = set.intersection(*map(set, by_round)) if by_round else set()
-    return mean_interval(
-        np.mean([pairs[seed][0] - pairs[seed][1] for pairs in by_round]) for seed in sorted(seeds)
-    )
 
 
 def shared_num_views(runs: list[Run]) -> list[int]:
@@ -160,50 +92,34 @@ def shared_num_views(runs: list[Run]) -> list[int]:
     return sorted(set.intersection(*sets)) if sets else []
 
 
-def common_num_views(runs: list[Run]) -> int | None:
-    """The largest number of views that every completed run has been measured at."""
-    return max(shared_num_views(runs), default=None)
+def by_seed(
+    runs: list[Run], policy: str, measure: str = "psnr", at: Sequence[int] | None = None
+) -> dict[int, float]:
+    """What each completed run of a policy reached, where it is known.
+
+    Args:
+      runs: of all policies.
+      policy: whose.
+      measure: key of a `Measure`.
+      at: numbers of views over which the mean is taken: a field trained from few views differs
+        from run to run by luck, of which the mean has less. None: the most that all runs share.
+    """
+    at = shared_num_views(runs)[-1:] if at is None else at
+    found = {run.seed: [run.value(measure, n) for n in at] for run in completed(runs, policy)}
+    return {seed: np.mean(values) for seed, values in found.items() if at and None not in values}
 
 
-def chosen_num_views(runs: list[Run]) -> list[int]:
-    """The shared numbers of views without that of the initial views."""
-    return shared_num_views(runs)[1:]
+def paired_gap(ours: dict[int, float], theirs: dict[int, float]) -> Interval | None:
+    """Mean difference over the seeds that both have: these share initial views, and so luck."""
+    return mean_interval(value - theirs[seed] for seed, value in ours.items() if seed in theirs)
 
 
-def by_seed(runs: list[Run], policy: str, measure: str, num_views: int | None) -> dict[int, float]:
-    """What each completed run of a policy reached, where it is known."""
-    values = {run.seed: run.value(measure, num_views) for run in completed(runs, policy)}
-    return {seed: value for seed, value in values.items() if value is not None}
-
-
-def _pairs(runs, policy, reference, measure, num_views) -> dict[int, tuple[float, float]]:
-    """By seed, what the two policies reached."""
-    ours, theirs = (by_seed(runs, name, measure, num_views) for name in (policy, reference))
-    return {seed: (value, theirs[seed]) for seed, value in ours.items() if seed in theirs}
-
-
-def mean_curve(runs: list[Run], policy: str, measure: str) -> list[tuple[int, Interval]]:
-    """(number of views, interval over seeds) of a policy, few views first."""
-    numbers = sorted({r["num_views"] for run in completed(runs, policy) for r in run.rounds})
-    curve = [(n, over_seeds(runs, policy, measure, n)) for n in numbers]
-    return [(n, interval) for n, interval in curve if interval is not None]
-
-
-def views_to_reach(curve: list[tuple[int, Interval]], target: float) -> float | None:
-    """Number of views at which a mean curve first reaches `target`, linear in between."""
-    for (n0, a), (n1, b) in itertools.pairwise(curve):
-        if a.mean < target <= b.mean:
-            return n0 + (n1 - n0) * (target - a.mean) / (b.mean - a.mean)
-    return None
-
-
-def mean_seconds(runs: list[Run], policy: str, part: str) -> float | None:
-    """Seconds of one part of the work, summed over rounds, mean over completed runs."""
-    totals = [
-        sum(r.get("seconds", {}).get(part) or 0.0 for r in run.rounds)
+def run_seconds(runs: list[Run], policy: str, *parts: str) -> Interval | None:
+    """Seconds of some parts of the work, all rounds of a run together, mean over its seeds."""
+    return mean_interval(
+        sum(r.get("seconds", {}).get(part) or 0.0 for r in run.rounds for part in parts)
         for run in completed(runs, policy)
-    ]
-    return float(np.mean(totals)) if totals else None
+    )
 
 
 # --- of several scenes ---
@@ -221,27 +137,23 @@ def mean_runs(runs_of_scenes: list[list[Run]]) -> list[Run]:
     Raises:
       ReportError: scenes were measured at different numbers of views.
     """
-    by_scene = [{(run.policy, run.seed): run for run in completed(runs)} for runs in runs_of_scenes]
-    shared = [key for key in by_scene[0] if all(key in others for others in by_scene)]
-    return [_mean_run([runs[key] for runs in by_scene]) for key in shared]
-
-
-def _mean_run(runs: list[Run]) -> Run:
-    first = runs[0]
-    if len({tuple(r["num_views"] for r in run.rounds) for run in runs}) > 1:
-        names = ", ".join(run.result["scene"]["name"] for run in runs)
-        raise ReportError(
-            f"{first.label}: {names} were measured at different numbers of views; there is no mean"
-        )
-    rounds = [_mean([run.rounds[i] for run in runs]) for i in range(len(first.rounds))]
-    return dataclasses.replace(first, rounds=rounds)
+    by_scene = [{run.label: run for run in completed(runs)} for runs in runs_of_scenes]
+    shared = [label for label in by_scene[0] if all(label in runs for runs in by_scene)]
+    means = []
+    for same in ([runs[label] for runs in by_scene] for label in shared):
+        if len({tuple(r["num_views"] for r in run.rounds) for run in same}) > 1:
+            names = ", ".join(run.result["scene"]["name"] for run in same)
+            fault = f"{names} were measured at different numbers of views; there is no mean"
+            raise ReportError(f"{same[0].label}: {fault}")
+        rounds = [_mean(list(rows)) for rows in zip(*(run.rounds for run in same))]
+        means.append(dataclasses.replace(same[0], rounds=rounds))
+    return means
 
 
 def _mean(values: list):
     """Mean of numbers, key by key in dicts; None where one is missing or no number."""
     if all(isinstance(value, dict) for value in values):
-        keys = [key for key in values[0] if all(key in value for value in values)]
-        return {key: _mean([value[key] for value in values]) for key in keys}
+        return {key: _mean([value.get(key) for value in values]) for key in values[0]}
     if all(isinstance(value, int | float) for value in values):
         return values[0] if len(set(values)) == 1 else float(np.mean(values))
     return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+from collections.abc import Sequence
 
 from experiments.reporting.stats import Interval, paired_p_value
 
@@ -19,16 +20,26 @@ class Cell:
     p_value: float | None = None  # of a gap
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Table:
-    head: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    """A heading and rows of cells; texts and numbers in place of a cell are made one."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+
+    def __post_init__(self):
+        self.head = tuple(self.head)
+        self.rows = [[c if isinstance(c, Cell) else Cell(str(c)) for c in r] for r in self.rows]
+
+    @property
+    def texts(self) -> list[Sequence[str]]:
+        """What is printed, the heading first."""
+        return [self.head, *([cell.text for cell in row] for row in self.rows)]
 
     @property
     def reasons(self) -> tuple[str, ...]:
         """Why there are dashes, each reason once."""
-        whys = [cell.why for row in self.rows for cell in row if cell.why]
-        return tuple(dict.fromkeys(whys))
+        return tuple(dict.fromkeys(cell.why for row in self.rows for cell in row if cell.why))
 
 
 def dash(why: str) -> Cell:
@@ -65,18 +76,17 @@ def seconds(value: float) -> str:
 
 # --- formats ---
 
-LATEX_SIGNS = {
-    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
-    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
-    **{"±": r"$\pm$", "−": "$-$", "—": "---", "×": r"$\times$", "<": "$<$", ">": "$>$"},
-}
+LATEX_SIGNS = str.maketrans(
+    {sign: f"\\{sign}" for sign in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    | {"±": r"$\pm$", "−": "$-$", "—": "---", "×": r"$\times$", "<": "$<$", ">": "$>$"}
+)
 
 
 def markdown(table: Table) -> str:
     """A table as Markdown, with the reasons for its dashes below."""
-    rows = [table.head, ["---"] * len(table.head)]
-    rows += [[cell.text for cell in row] for row in table.rows]
-    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    head, *rows = table.texts
+    lines = ["| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows)]
     reasons = [f"\n— {'; '.join(table.reasons)}."] if table.reasons else []
     return "\n".join([*lines, *reasons])
 
@@ -87,35 +97,28 @@ def comma_separated(table: Table) -> str:
     A column of intervals is followed by one of their halves, and one of gaps by their p-values.
     What says nothing is empty, and a last column says why.
     """
-    columns = list(zip(table.head, zip(*table.rows)))
-    columns = [column for title, cells in columns for column in _csv_columns(title, cells)]
+    columns = []
+    for title, *cells in zip(table.head, *table.rows):
+        intervals = [cell.interval for cell in cells]
+        means = ["" if c.why else c.interval.mean if c.interval else c.text for c in cells]
+        columns.append([title, *means])
+        if any(intervals):
+            halves = [interval and interval.half for interval in intervals]
+            columns.append([f"{title}, half of the 95 % interval", *halves])
+        if any(cell.p_value is not None for cell in cells):
+            p_values = [cell.p_value for cell in cells]
+            columns.append([f"{title}, p of the paired t-test", *p_values])
     if table.reasons:
         whys = [dict.fromkeys(cell.why for cell in row if cell.why) for row in table.rows]
-        columns.append(("why cells are empty", ["; ".join(why) for why in whys]))
+        columns.append(["why cells are empty", *map("; ".join, whys)])
     file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow([title for title, _ in columns])
-    writer.writerows(zip(*(cells for _, cells in columns)))
+    csv.writer(file, lineterminator="\n").writerows(zip(*columns))  # None is left empty
     return file.getvalue().rstrip("\n")
-
-
-def _csv_columns(title: str, cells: tuple[Cell, ...]) -> list[tuple[str, list]]:
-    means = ["" if c.why else c.interval.mean if c.interval else c.text for c in cells]
-    columns = [(title, means)]
-    if any(cell.interval for cell in cells):
-        halves = [cell.interval and cell.interval.half for cell in cells]
-        columns.append((f"{title}, half of the 95 % interval", halves))  # None is left empty
-    if any(cell.p_value is not None for cell in cells):
-        columns.append((f"{title}, p of the paired t-test", [cell.p_value for cell in cells]))
-    return columns
 
 
 def latex(table: Table) -> str:
     """A table for LaTeX with the booktabs package, with the reasons for its dashes below."""
-    head, *rows = (
-        " & ".join(map(latex_text, texts)) + r" \\"
-        for texts in (table.head, *([cell.text for cell in row] for row in table.rows))
-    )
+    head, *rows = (" & ".join(map(latex_text, texts)) + r" \\" for texts in table.texts)
     start = rf"\begin{{tabular}}{{l{'r' * (len(table.head) - 1)}}}"
     lines = [start, r"\toprule", head, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}"]
     if table.reasons:
@@ -125,12 +128,11 @@ def latex(table: Table) -> str:
 
 def latex_text(text: str) -> str:
     """Text in which no sign means anything to LaTeX but itself."""
-    return "".join(LATEX_SIGNS.get(sign, sign) for sign in text)
+    return text.translate(LATEX_SIGNS)
 
 
 FORMATS = {"markdown": markdown, "csv": comma_separated, "latex": latex}
-# What is no table, as a line of each format.
-AS_TEXT = {"markdown": str, "csv": lambda text: f"# {text}", "latex": lambda text: f"% {text}"}
+COMMENT = {"markdown": "", "csv": "# ", "latex": "% "}  # before what is no table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,11 +141,11 @@ class Collected:
 
     made: str  # by which command, on what
     tables: dict[str, Table]
-    notes: tuple[str, ...] = ()  # what is missing, and why
+    notes: Sequence[str] = ()  # what is missing, and why
 
 
 def collected_text(
-    found: Collected, *, form: str = "markdown", names: list[str] | None = None
+    found: Collected, *, form: str = "markdown", names: Sequence[str] | None = None
 ) -> str:
     """What was made, the tables and the notes.
 
@@ -152,10 +154,10 @@ def collected_text(
       form: a key of `FORMATS`.
       names: of the tables, those that there are; None: all.
     """
-    as_text = AS_TEXT[form]
-    blocks = [as_text(found.made)]
+    sign = COMMENT[form]
+    blocks = [sign + found.made]
     for name in [name for name in names or found.tables if name in found.tables]:
-        title = [] if form == "markdown" else [as_text(name)]
-        blocks.append("\n".join([*title, FORMATS[form](found.tables[name])]))
-    blocks += [latex_text(n) if form == "latex" else as_text(n) for n in found.notes]
+        title = f"{sign}{name}\n" if sign else ""
+        blocks.append(title + FORMATS[form](found.tables[name]))
+    blocks += [sign + note for note in found.notes]
     return "\n\n".join(blocks) + "\n"
