@@ -111,7 +111,7 @@ def test_of_many_policies_the_few_that_matter_have_a_colour(tmp_path):
     assert labels == policies[:7]
     gap = stats.paired_gap(*(stats.by_seed(runs, name) for name in ("bavs", "random")))
     np.testing.assert_allclose(gap[:2], [1.0, 0.0], atol=1e-12)
-    assert "Grey: the means of the other policies" in _words(_page(tmp_path))
+    assert "Grey: the runs of the other policies" in _words(_page(tmp_path))
 
 
 def test_the_gap_over_rounds_is_paired_and_leaves_the_initial_views_out(full_workdir):

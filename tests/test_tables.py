@@ -1,7 +1,6 @@
 """Tables of result files in every format; the README's are those that the committed files make."""
 
 import csv
-import dataclasses
 import io
 import itertools
 import json
@@ -21,7 +20,6 @@ from experiments.reporting.result_tables import (
 )
 from experiments.reporting.results import load_runs
 from experiments.reporting.run_tables import PAPER
-from experiments.reporting.stats import mean_runs
 from experiments.reporting.tables import (
     Cell,
     Table,
@@ -299,18 +297,19 @@ def test_a_sweep_over_scenes_has_their_mean_and_the_papers_rows(tmp_path):
     assert row[2].text == rows["random"][3].text and row[3].text == "27.14"
 
 
-def test_means_over_scenes_are_taken_measure_by_measure(tmp_path):
+def test_means_over_scenes_are_taken_seed_by_seed(tmp_path):
     folder = make_scenes(tmp_path)
     scenes = [load_runs(folder / f"scene={name}") for name in ("lego", "ship")]
-    mean = next(run for run in mean_runs(scenes) if run.label == "random, seed 0")
-    first, second = (next(r for r in runs if r.label == mean.label) for runs in scenes)
-    for ours, a, b in zip(mean.rounds, first.rounds, second.rounds, strict=True):
-        assert ours["psnr"] == pytest.approx((a["psnr"] + b["psnr"]) / 2)
-        assert ours["num_views"] == a["num_views"] and ours["lpips"] is None
-    assert mean.rounds[-1]["num_survivors"] == 5
-    assert mean.rounds[-1]["seconds"]["score"] == 1.5
-    with pytest.raises(ReportError, match="lego, ship were measured at different numbers of views"):
-        mean_runs([scenes[0], [dataclasses.replace(second, rounds=second.rounds[1:])]])
+    runs = stats.in_all_scenes(scenes)
+    assert sorted(run.label for run in runs if run.policy == "bavs") == (
+        ["bavs, seed 0"] * 2 + ["bavs, seed 1"] * 2
+    )
+    one, other = (stats.by_seed(some, "random") for some in scenes)
+    means = {seed: pytest.approx((one[seed] + other[seed]) / 2) for seed in (0, 1, 2)}
+    assert stats.by_seed(runs, "random") == means
+    assert stats.by_seed(runs, "random", "lpips") == {}
+    found = stats.run_seconds(runs, "random", "score")
+    assert (found.mean, found.num) == (pytest.approx(1.5), 3)  # 0 s on lego, 3 s on ship
 
 
 def test_a_sweep_over_options_has_no_row_of_the_paper(tmp_path):

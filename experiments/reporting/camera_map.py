@@ -96,14 +96,11 @@ def map_plot(acquisition: dict[str, np.ndarray], *, salt: str) -> Markup:
 
 
 def _draw_sky(axes: Axes, shown: np.ndarray) -> None:
-    """Circles of equal elevation, and limits that hold every camera."""
+    """Circles of equal elevation, 60, 30 and 0 degrees, and limits that hold every camera."""
     for elevation in (60, 30, 0):
         radius = 2.0 * math.sin(math.radians(90 - elevation) / 2.0)
-        edge = {"linewidth": 0.6 if elevation else 1.1, "edgecolor": plots.PALE}
-        axes.add_patch(Circle((0, 0), radius, facecolor="none", zorder=0, **edge))
-        name = f"{elevation}°" if elevation else "horizon"
-        look = {"fontsize": 6.5, "color": "#8b93a1", "ha": "center", "backgroundcolor": "white"}
-        axes.text(0, -radius, name, clip_on=True, zorder=0.5, **look)
+        edge = {"linewidth": 0.6 if elevation else 1.2, "edgecolor": plots.PALE, "zorder": 0}
+        axes.add_patch(Circle((0, 0), radius, facecolor="none", **edge))
     low, high = shown.min(axis=0), shown.max(axis=0)
     middle, half = (low + high) / 2.0, 0.6 * max((high - low).max(), 0.1)
     axes.set_xlim(middle[0] - half, middle[0] + half)

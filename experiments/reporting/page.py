@@ -26,24 +26,17 @@ class Section(NamedTuple):
 
 
 def write_page(path: str | os.PathLike, *, title: str, made: dict, sections: list[Section]) -> None:
-    """Writes a page of a title and sections.
-
-    Args:
-      path: where to.
-      title: of the page.
-      made: a result file: its scene, device, command and versions are shown.
-      sections: from top to bottom.
-    """
+    """Writes a page of sections about a result file, whose making it shows too."""
     write_template(path, FOLDER / "sections.html", title=title, made=made, sections=sections)
 
 
 def write_template(path: str | os.PathLike, template: pathlib.Path, **content) -> None:
-    """Writes a template, filled.
+    """Writes a template, filled; its texts are escaped, `Markup` is not.
 
     Args:
       path: where to.
       template: its file, or the folder of `template.html`; it may extend the shared `base.html`.
-      **content: every name that the template uses; text is escaped, `Markup` is not.
+      **content: every name that the template uses.
 
     Raises:
       jinja2.UndefinedError: the template uses a name that `content` lacks.

@@ -74,10 +74,9 @@ def uncertainty_limits(all_pictures: list[dict[str, np.ndarray]]) -> tuple[float
     values = np.concatenate([np.zeros(0), *(image[np.isfinite(image)] for image in images)])
     if values.size == 0:
         return 0.0, 1.0
-    high = np.percentile(values, 99.0)
-    low = np.percentile(values[values >= 0.5 * high], 2.0)
-    low, high = np.floor(low * 100) / 100, np.ceil(high * 100) / 100
-    return float(low), float(max(high, low + 0.01))
+    top = np.percentile(values, 99.0)
+    low = np.floor(100.0 * np.percentile(values[values >= 0.5 * top], 2.0)) / 100.0
+    return float(low), float(max(np.ceil(100.0 * top) / 100.0, low + 0.01))
 
 
 def psnr_words(rgb: np.ndarray, truth: np.ndarray) -> str:
@@ -137,11 +136,7 @@ def colour_bar(figure: Figure, axes, colours: str, limits, label: str) -> None:
 
 
 def views_figure(
-    pictures: dict[str, dict[str, np.ndarray]],
-    num_views: int,
-    limits: tuple[float, float] | None = None,
-    *,
-    errors: bool = False,
+    pictures: dict[str, dict[str, np.ndarray]], num_views: int, limits=None, *, errors=False
 ) -> Figure:
     """A row for each test view: the truth, then each policy's render and rendered uncertainty.
 
@@ -155,25 +150,27 @@ def views_figure(
       ReportError: there is no such view.
     """
     places = {p: {int(v): i for i, v in enumerate(a["view_ids"])} for p, a in pictures.items()}
-    first = next(iter(pictures))
-    shared = [view for view in places[first] if all(view in place for place in places.values())]
+    first, *others = places.values()
+    shared = [view for view in first if all(view in other for other in others)]
     if not shared:
         raise ReportError(f"{', '.join(pictures)}: show no test view in common; name one policy")
     limits = limits or uncertainty_limits([*pictures.values()])
     rows = []
     for view in shared[:num_views]:
-        at = places[first][view]
-        panels = [Panel("truth", shrink(pictures[first]["truth"][at], MAX_SIDE) / 255.0)]
+        panels = []
         for policy, arrays in pictures.items():
             whole = {name: arrays[name][places[policy][view]] for name in IMAGES}
+            truth, rgb, error, uncertainty = (shrink(image, MAX_SIDE) for image in whole.values())
+            if not panels:
+                panels.append(Panel("truth", truth / 255.0))
             psnr = psnr_words(whole["rgb"], whole["truth"])
-            small = {name: shrink(image, MAX_SIDE) for name, image in whole.items()}
-            panels.append(Panel(f"{policy}, {psnr}", small["rgb"] / 255.0))
+            panels.append(Panel(f"{policy}, {psnr}", rgb / 255.0))
             if errors:
-                mean = f"error {small['error'].mean():.3f}"
-                panels.append(Panel(mean, small["error"], ERROR_MAP, (0.0, ERROR_LIMIT)))
-            panels.append(Panel(f"{policy}, uncertainty", small["uncertainty"], limits=limits))
-        rows.append((pathlib.PurePath(str(pictures[first]["names"][at])).stem, panels))
+                title = f"error {error.mean():.3f}"
+                panels.append(Panel(title, error, ERROR_MAP, (0.0, ERROR_LIMIT)))
+            panels.append(Panel(f"{policy}, uncertainty", uncertainty, limits=limits))
+        name = next(iter(pictures.values()))["names"][first[view]]
+        rows.append((pathlib.PurePath(str(name)).stem, panels))
     return panel_table(rows, scale_label="uncertainty (in [0, 1])")
 
 
@@ -189,7 +186,7 @@ def first_pictures(runs: list[Run]) -> dict[str, tuple[Run, dict[str, np.ndarray
 def write_figures(
     workdir: pathlib.Path, *, form: str = "png", policies: Sequence[str] = (), num_views: int = 4
 ) -> list[pathlib.Path]:
-    """Writes every figure that the results of a folder have numbers for.
+    """Writes every figure that the results of a folder have numbers for, and says where.
 
     Args:
       workdir: with `summary.json` and the arrays of each run.
@@ -197,26 +194,16 @@ def write_figures(
       policies: which, in this order; none: all.
       num_views: most test views.
 
-    Returns:
-      The files.
-
     Raises:
       ReportError: a file that cannot be used, or a policy without a run.
     """
     runs = load_runs(workdir, policies)
-    figures = {}
-    for measure in stats.MEASURES:
-        figure = plots.quality_figure(runs, policies_of(runs), measure)
-        if figure is not None:
-            # A page says this beside the figure; a file has to say it itself.
-            scene = runs[0].result["scene"]["name"]
-            what = f"training views of {scene} (thin: each seed; band: 95 % interval)"
-            figure.axes[0].set_xlabel(what, fontsize=9)
-            figures[measure.key] = figure
+    shown = policies_of(runs)
+    figures = {m.key: plots.quality_figure(runs, shown, m) for m in stats.MEASURES}
     pictures = {policy: arrays for policy, (_, arrays) in first_pictures(runs).items()}
     if pictures:
         figures["views"] = views_figure(pictures, num_views)
-    paths = [workdir / "figures" / f"{name}.{form}" for name in figures]
-    for path, figure in zip(paths, figures.values()):
+    paths = {workdir / "figures" / f"{name}.{form}": f for name, f in figures.items() if f}
+    for path, figure in paths.items():
         plots.save_figure(figure, path)
-    return paths
+    return [*paths]

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable
 
 import matplotlib
+import numpy as np
 from markupsafe import Markup
 from matplotlib import style as matplotlib_style
 from matplotlib.axes import Axes
@@ -85,35 +86,33 @@ def by_interest(policies: Iterable[str]) -> list[str]:
 def quality_figure(runs: list[Run], policies: list[str], measure: Measure) -> Figure | None:
     """One measure against the number of training views, or None if no run has it.
 
-    Policies after the first seven are thin grey means without names.
+    Of policies after the first seven there are the single runs alone, grey and without names.
     """
     style = policy_style(policies[:MANY])
     figure = Figure(figsize=(5.4, 3.7))
     axes = figure.add_subplot()
     numbers = sorted({r["num_views"] for run in runs for r in run.rounds})
-    for run in (run for run in runs if run.policy in style):
+    for run in runs:
         points = [(n, value) for n in numbers if (value := run.value(measure.key, n)) is not None]
+        colour, _ = style.get(run.policy, (PALE, None))
         look = {"linewidth": 0.8, "linestyle": "-" if run.completed else ":", "alpha": 0.6}
         if points:
-            axes.plot(*zip(*points), color=style[run.policy][0], **look)
+            axes.plot(*zip(*points), color=colour, **look)
     if not axes.lines:
         return None
-    bands = []
-    for policy in policies:
-        curve = {
-            n: stats.mean_interval(stats.by_seed(runs, policy, measure.key, [n])) for n in numbers
-        }
-        curve = {n: interval for n, interval in curve.items() if interval is not None}
-        look = {"color": PALE, "zorder": 0.5}
-        if policy in style:
-            look = dict(zip(("color", "marker"), style[policy]), linewidth=2.0, label=policy)
-            bands.append({n: i for n, i in curve.items() if i.num >= MIN_BAND})
-        axes.plot([*curve], [interval.mean for interval in curve.values()], **look, **DOT)
     axes.set_ylim(axes.get_ylim())  # bands over few seeds are so wide that nothing else would show
-    for (colour, _), band in zip(style.values(), bands):
-        low, high = ([i.mean + s * i.half for i in band.values()] for s in (-1, 1))
-        axes.fill_between([*band], low, high, color=colour, alpha=0.14, linewidth=0)
-    axes.set_xlabel("training views")
+    for policy, (colour, marker) in style.items():
+        means = [
+            stats.mean_interval(stats.by_seed(runs, policy, measure.key, [n])) for n in numbers
+        ]
+        curve = [(n, *mean) for n, mean in zip(numbers, means) if mean is not None]
+        x, mean, half, num = np.array(curve, float).reshape(-1, 4).T
+        axes.plot(x, mean, color=colour, marker=marker, linewidth=2.0, label=policy, **DOT)
+        half[num < MIN_BAND] = np.nan
+        axes.fill_between(x, mean - half, mean + half, color=colour, alpha=0.14, linewidth=0)
+    scene = runs[0].result["scene"]["name"]
+    label = f"training views of {scene} (thin: each seed; band: 95 % interval)"
+    axes.set_xlabel(label, fontsize=9)
     axes.set_title(f"{measure.heading}, {measure.better} is better")
     axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     tidy(axes, "y")

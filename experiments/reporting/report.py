@@ -6,21 +6,14 @@ import json
 import os
 from pathlib import Path
 
-from experiments.reporting import pictures, plots, run_tables, stats
+from experiments.reporting import pictures, plots, results, run_tables, stats
 from experiments.reporting.camera_map import map_plot
 from experiments.reporting.page import FOLDER, write_template
-from experiments.reporting.results import (
-    Run,
-    load_acquisition,
-    load_runs,
-    policies_of,
-)
 from experiments.reporting.stats import MEASURES, REFERENCES
 from experiments.reporting.tables import interval_cell
 
 SEED_SPREAD = (
-    "One seed proves little: the spread between seeds is often half a dB, as large as most gains. "
-    "Run at least 5 seeds before drawing a conclusion."
+    "One seed proves little: seeds often differ by half a dB, as much as most gains; run 5 or more."
 )
 
 
@@ -37,17 +30,15 @@ def write_report(workdir: str | os.PathLike) -> Path:
     Raises:
       ReportError: a file is missing, broken or of another schema version.
     """
-    runs = load_runs(Path(workdir))
-    policies = plots.by_interest(policies_of(runs))
+    runs = results.load_runs(Path(workdir))
+    policies = plots.by_interest(results.policies_of(runs))
     runs = sorted(runs, key=lambda run: (policies.index(run.policy), run.seed))
-    curves, missing = [], []
+    curves = []
     for measure in MEASURES:
         figure = plots.quality_figure(runs, policies, measure)
         if figure is not None:
             label = f"{measure.label} against training views"
             curves.append(plots.to_svg(figure, salt=f"quality-{measure.key}", label=label))
-        elif runs:
-            missing.append(run_tables.missing_measure(measure, runs))
     configs: dict[str, list[str]] = {}
     for run in runs:
         made = {key: run.result.get(key) for key in ("versions", "config")}
@@ -60,10 +51,7 @@ def write_report(workdir: str | os.PathLike) -> Path:
         runs=runs,
         policies=policies,
         headline=make_headline(runs, policies),
-        finals={p: stats.mean_interval(stats.by_seed(runs, p)) for p in policies[: plots.MANY]},
-        colours=plots.policy_style(policies),
         curves=curves,
-        missing=missing,
         final=run_tables.final_table(runs, policies),
         by_round=run_tables.rounds_table(runs, policies),
         strips=_strips(runs),
@@ -74,7 +62,7 @@ def write_report(workdir: str | os.PathLike) -> Path:
     return path
 
 
-def _strips(runs: list[Run]) -> dict[str, tuple]:
+def _strips(runs: list[results.Run]) -> dict[str, tuple]:
     """By policy, of its first run that has some: label, round, and its test views."""
     found = pictures.first_pictures(runs)
     limits = pictures.uncertainty_limits([arrays for _, arrays in found.values()])
@@ -89,17 +77,17 @@ def _strips(runs: list[Run]) -> dict[str, tuple]:
     return strips
 
 
-def _maps(runs: list[Run]) -> dict[str, tuple]:
+def _maps(runs: list[results.Run]) -> dict[str, tuple]:
     """By run, the maps of its rounds and the table of its choices."""
     maps = {}
     for number, run in enumerate(runs):
-        if (arrays := load_acquisition(run)) is not None:
+        if (arrays := results.load_acquisition(run)) is not None:
             svg = map_plot(arrays, salt=f"map{number}")
             maps[run.label] = svg, run_tables.choices_table(run, arrays)
     return maps
 
 
-def make_headline(runs: list[Run], policies: list[str]) -> tuple[str, str]:
+def make_headline(runs: list[results.Run], policies: list[str]) -> tuple[str, str]:
     """What came out, and what that proves, for better or worse."""
     done = plots.by_interest(p for p in policies if stats.completed(runs, p))
     num_views = max(stats.shared_num_views(runs), default=None)

@@ -81,8 +81,8 @@ def _sweep_tables(
     if over_scenes:
         notes = [f"Tables after the first are of means over these {len(settings)} scenes."]
         policies = list(dict.fromkeys(p for setting in settings for p in setting.policies))
-        means = stats.mean_runs([*runs.values()])
-        tables |= _quality(means, policies, paper) if means else {}
+        shared = stats.in_all_scenes(runs.values())
+        tables |= _quality(shared, policies, paper) if shared else {}
     elif paper is not None:
         raise ReportError(f"{folder}: {paper} is over scenes; give the folder of one setting")
     return _collected(record, runs, tables, only, notes)

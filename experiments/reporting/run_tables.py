@@ -47,9 +47,10 @@ def final_table(runs: list[Run], policies: list[str]) -> Table:
     rows = []
     for policy in policies:
         mine = stats.completed(runs, policy)
+        num = len({run.seed for run in mine})
         stuck = [str(run.seed) for run in mine if any(r.get("stuck") for r in run.rounds)]
         why = f"{policy}: a field of seed {', '.join(stuck)} is stuck in fog, so these numbers are "
-        seeds = Cell(f"{len(mine)}*", f"{why}not its policy's") if stuck else len(mine)
+        seeds = Cell(f"{num}*", f"{why}not its policy's") if stuck else num
         rows.append([policy, seeds, *_cells(runs, policy, MEASURES, references)])
     head = ["policy", "seeds", "views", *(m.heading for m in MEASURES)]
     return Table([*head, *(f"PSNR gap to {p} (dB)" for p in references)], rows)
