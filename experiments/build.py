@@ -26,12 +26,12 @@ from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.training.fit import Trainer, is_stuck, single_colour_error
 from bavs_jax.training.train import TrainInfo, TrainState
+from bavs_jax.uncertainty.channel import make_render_chunk_fn
 from bavs_jax.uncertainty.measures import make_true_error_fn
 from bavs_jax.uncertainty.model import RECONSTRUCTION, LaplaceOptions, ModelFns, SceneSetup
 from bavs_jax.uncertainty.models import MODELS
 from bavs_jax.uncertainty.models.laplace import laplace_variance
 from bavs_jax.uncertainty.posterior import default_prior_weight
-from bavs_jax.uncertainty.scoring import make_render_chunk_fn
 from bavs_jax.uncertainty.streaming import CurvatureOfRays, curvature_group_size
 from experiments.build_field import build_flow
 from experiments.build_scene import make_source

@@ -35,9 +35,8 @@ from bavs_jax.rendering.samplers import make_occupancy_sampler
 from bavs_jax.rendering.sampling import make_march_options
 from bavs_jax.rendering.spacing import box_intervals
 from bavs_jax.training.train import init_train_state, make_train_fn
-from bavs_jax.uncertainty.channel import vertex_variance
+from bavs_jax.uncertainty.channel import make_render_chunk_fn, mean_uncertainty, vertex_variance
 from bavs_jax.uncertainty.predictive import make_predictive_fn
-from bavs_jax.uncertainty.scoring import make_render_chunk_fn, mean_uncertainty
 from bavs_jax.uncertainty.streaming import make_curvature_fn, table_rays
 from tests.toy_scenes import toy_scene
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from bavs_jax.fields.deformation import cell_sides, vertices_in_box
 from bavs_jax.pixel_table import training_pixels
-from bavs_jax.uncertainty.channel import vertex_variance
+from bavs_jax.uncertainty.channel import make_render_chunk_fn, vertex_variance
 from bavs_jax.uncertainty.model import (
     Acquired,
     LaplaceOptions,
@@ -16,7 +16,6 @@ from bavs_jax.uncertainty.model import (
 )
 from bavs_jax.uncertainty.posterior import offset_variance
 from bavs_jax.uncertainty.predictive import make_predictive_fn
-from bavs_jax.uncertainty.scoring import make_render_chunk_fn
 from bavs_jax.uncertainty.streaming import table_rays
 
 
