@@ -93,19 +93,7 @@ class Problem:
         variance = None
         if jac_sq_sum is not None:
             variance = laplace_variance(jac_sq_sum, num_rays, self.laplace)
-        return partial(self._render_chunk, train.model, variance)
-
-    @cached_property
-    def _render_chunk(self) -> Callable:
-        options = self.laplace
-        return make_render_chunk_fn(
-            self.model,
-            self.grid,
-            variant=options.variant,
-            scale=options.scale,
-            extent=options.extent,
-            mesh=self.mesh,
-        )
+        return partial(self.setup.render_chunk, train.model, variance)
 
     def density(self, train: TrainState, positions) -> jax.Array:
         """At points [K, 3]: [K] 1 / scene unit, 0 where nothing is rendered."""
@@ -136,6 +124,14 @@ class Problem:
                 self.grid,
                 group_size=curvature_group_size(self.grid.num_vertices, len(self.table.cameras)),
                 track=self.track,
+                mesh=self.mesh,
+            ),
+            render_chunk=make_render_chunk_fn(
+                self.model,
+                self.grid,
+                variant=self.laplace.variant,
+                scale=self.laplace.scale,
+                extent=self.laplace.extent,
                 mesh=self.mesh,
             ),
             train=train,

@@ -28,6 +28,9 @@ EXTENTS = ("box", "space")
 SCALES = ("log", "sigma")
 LOG10_MIN, LOG10_MAX = -3.0, 6.0
 
+# See `make_render_chunk_fn`.
+RenderChunkFn = Callable[[ModelState, Array | None, Rays], dict[str, jax.Array]]
+
 
 def vertex_variance(
     jac_sq_sum: jax.Array, *, num_rays, prior_weight, weighting: str, variant: str
@@ -116,7 +119,7 @@ def make_render_chunk_fn(
     scale: str,
     extent: str = "box",
     mesh: Mesh | None = None,
-) -> Callable[[ModelState, Array | None, Rays], dict[str, jax.Array]]:
+) -> RenderChunkFn:
     """Makes the compiled rendering of a chunk of rays, uncertainty included (Fig 4).
 
     The devices of a `mesh` (see `devices.py`) share the rays.
