@@ -32,6 +32,7 @@ from experiments.reporting.pictures import (
     Panel,
     colour_bar,
     panel_table,
+    shrink,
     uncertainty_limits,
 )
 from experiments.reporting.tables import Cell, Table, dash
@@ -45,6 +46,7 @@ CSV_COLUMNS = (
     *("order", "x", "y", "z", "qx", "qy", "qz", "qw", "look_x", "look_y", "look_z"),
     *("score", "share_of_best", "picked"),
 )
+MAX_SIDE = 300  # pixels of a preview
 RARE = 90.0  # percentile of the photos' pixels above which uncertainty counts as high
 FOGGY = 0.1  # share of the photos inside of matter from which on the field counts as foggy
 NUDGE = np.array([1e-9, 0.0, 0.0])  # scene units; gives a direction where there is none
@@ -304,9 +306,10 @@ def preview_plots(images: list[dict]) -> list[Markup]:
     limits = uncertainty_limits([{"uncertainty": image["uncertainty"][None]} for image in images])
     rows = []
     for number, image in enumerate(images, start=1):
+        rgb = shrink(np.uint8(np.round(255.0 * image["rgb"].clip(0.0, 1.0))), MAX_SIDE) / 255.0
         title = f"uncertainty, mean {image['uncertainty'].mean():.3f}"
-        panels = [Panel("render", image["rgb"]), Panel(title, image["uncertainty"], limits=limits)]
-        rows.append((str(number), panels))
+        uncertainty = Panel(title, shrink(image["uncertainty"], MAX_SIDE), limits=limits)
+        rows.append((str(number), [Panel("render", rgb), uncertainty]))
     half = -(-len(rows) // 2)
     return [
         plots.to_svg(

@@ -218,7 +218,7 @@ def write_page(path: pathlib.Path, result: dict, *, arrays: dict, variant: str) 
         *(_interval_section(result, quantity) for quantity in known_quantities(rows)),
         Section(
             "Some test views",
-            note=f"Colour error and half-width at {LEVEL:.0%}: 0 (dark) to {ERROR_LIMIT}; white: "
+            note=f"Colour error and half-width at {LEVEL:.0%}: 0 (dark) to {ERROR_LIMIT}; blank: "
             "no band. Uncertainty: up to the 99th percentile of the model's pixels.",
             plots=view_plots(pictures),
         ),
