@@ -32,10 +32,10 @@ from bavs_jax.selection.information import (
 )
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.selection.worth import Worth, worth_along
+from bavs_jax.uncertainty.channel import mean_uncertainty
 from bavs_jax.uncertainty.model import RECONSTRUCTION
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
-from bavs_jax.uncertainty.scoring import mean_uncertainty
 from experiments.build import RENDER_CHUNK
 from experiments.configs import capture
 from experiments.errors import shown
