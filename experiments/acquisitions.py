@@ -88,29 +88,44 @@ def acquisition_arrays(scene, initial, choices: list[dict]) -> dict[str, np.ndar
     }
 
 
+def nerfstudio_frames(scene, cameras: Cameras) -> list[dict]:
+    """Cameras [k] of a scene as frames of a nerfstudio `transforms.json`, without names.
+
+    Poses are in the user's coordinates, intrinsics for the size of the scene's files.
+    """
+    cameras = photo_cameras(scene, cameras)
+    frames = []
+    for i, pose in enumerate(user_transforms(scene, cameras.world_from_cam)):
+        fx, fy, cx, cy = (float(x) for x in cameras.intrinsics[i])
+        width, height = (int(n) for n in cameras.sizes[i])
+        frame = {"transform_matrix": pose.tolist(), "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+        frame |= {"w": width, "h": height}
+        distortion = np.asarray(cameras.distortion[i], float).tolist()
+        frames.append(frame | dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), distortion)))
+    return frames
+
+
+def write_frames(path: pathlib.Path, scene, frames: list[dict]) -> None:
+    """Writes frames as a nerfstudio `transforms.json`."""
+    lens = "OPENCV_FISHEYE" if scene.cameras.lens == "fisheye" else "OPENCV"
+    write_json(path, {"camera_model": lens, "frames": frames})
+
+
 def write_next_views(path: pathlib.Path, scene, choices: list[dict]) -> None:
     """Writes the chosen poses as a nerfstudio `transforms.json`, in the user's coordinates.
 
-    Intrinsics are for the size of the scene's files. Frames come in the order of choosing; `round`,
-    `rank` and `score` say when and why.
+    Frames come in the order of choosing; `round`, `rank` and `score` say when and why.
     """
     frames = []
     for number, choice in enumerate(choices, start=1):
         cameras = Cameras(**{name: choice[name] for name in CAMERA_FIELDS})
-        cameras = photo_cameras(scene, cameras)
-        poses = user_transforms(scene, cameras.world_from_cam)
-        for rank, index in enumerate(choice["selected"]):
-            view_id = int(choice["candidate_ids"][index])
-            fx, fy, cx, cy = (float(x) for x in cameras.intrinsics[rank])
-            width, height = (int(n) for n in cameras.sizes[rank])
+        for rank, frame in enumerate(nerfstudio_frames(scene, cameras)):
+            view_id = int(choice["candidate_ids"][choice["selected"][rank]])
             name = scene.names[view_id] if view_id >= 0 else f"next/{number}_{rank + 1}.png"
-            frame = {"file_path": name, "transform_matrix": poses[rank].tolist()}
-            frame |= {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": width, "h": height}
-            frame |= zip(("k1", "k2", "k3", "k4", "p1", "p2"), cameras.distortion[rank].tolist())
             score = float(choice["selected_scores"][rank])
-            frames.append(frame | {"round": number, "rank": rank + 1, "score": score})
-    lens = "OPENCV_FISHEYE" if scene.cameras.lens == "fisheye" else "OPENCV"
-    write_json(path, {"camera_model": lens, "frames": frames})
+            how = {"round": number, "rank": rank + 1, "score": score}
+            frames.append({"file_path": name, **frame, **how})
+    write_frames(path, scene, frames)
 
 
 def _choice_path(folder: pathlib.Path, number: int) -> pathlib.Path:

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from PIL import Image
 
+from bavs_jax.cameras import num_pixels
 from bavs_jax.metrics.image import depth_mae, measure_images
 from bavs_jax.rendering.images import render_views
 from experiments.build import RENDER_CHUNK
@@ -83,8 +84,12 @@ def evaluate_views(
 
     Returns:
       dict of `psnr` (dB), `ssim`, `lpips`, `depth_mae` (scene units), `num_test_views` and
-      `thinned` (share of rays sampled more coarsely than asked for); null where not measured.
+      `thinned` (share of rays sampled more coarsely than asked for); null where not measured, as
+      all but the number are of no views.
     """
+
+    if not len(view_ids):
+        return {**mean_quality(scene, [], []), "thinned": None, "num_test_views": 0}
 
     def measured_part(rays):
         rendering = render_fn(rays)
@@ -101,6 +106,22 @@ def evaluate_views(
     means = mean_quality(scene, view_ids, images, lpips_fn=lpips_fn)
     thinned = float(np.mean([image["thinned"].mean() for image in images]))
     return {**means, "thinned": thinned, "num_test_views": len(images)}
+
+
+def render_with_bar(
+    render_fn, cameras, view_ids, label: str, *, rays_per_pixel: int = 1
+) -> list[dict[str, np.ndarray]]:
+    """`render_views` with progress under a label."""
+    num_rays = rays_per_pixel * int(num_pixels(cameras)[view_ids].sum())
+    with track(num_rays, label, "rays") as bar:
+        return render_views(
+            render_fn,
+            cameras,
+            view_ids,
+            chunk=RENDER_CHUNK,
+            rays_per_pixel=rays_per_pixel,
+            progress_fn=bar.advance,
+        )
 
 
 def measure_test_views(problem, train, num: int, label: str) -> dict:
@@ -157,13 +178,18 @@ def _mean(values) -> float | None:
 
 
 def picture_arrays(render_fn, scene, view_ids, *, rays_per_pixel: int = 1) -> dict[str, np.ndarray]:
-    """Truth, render, error, uncertainty and depth of some views, for the report.
-
-    Views may differ in size: see `stack_pictures`, and `sizes` [n, 2] (width, height).
-    """
+    """Renders some views for the report; see `image_arrays`."""
     images = render_views(
         render_fn, scene.cameras, view_ids, chunk=RENDER_CHUNK, rays_per_pixel=rays_per_pixel
     )
+    return image_arrays(scene, view_ids, images)
+
+
+def image_arrays(scene, view_ids, images: list[dict]) -> dict[str, np.ndarray]:
+    """Truth, render, error, uncertainty and depth of rendered views, for the report.
+
+    Views may differ in size: see `stack_pictures`, and `sizes` [n, 2] (width, height).
+    """
     truth = stack_pictures([scene.image(v) for v in view_ids])
     rgb = stack_pictures([np.clip(image["rgb"], 0.0, 1.0) for image in images])
     return {

@@ -4,10 +4,9 @@
         --config=experiments/configs/uncertainty.py --workdir=runs/uncertainty
 
 Every uncertainty model is measured on test views by AUSE in all its variants, on its own field and
-on one common field; and its uncertainty is turned into intervals of colour and depth, calibrated on
-views that nothing was trained on and tested on yet others. What is there already in --workdir is
-not computed again: one may kill it and start it again. A folder that
-`experiments.active_selection` has filled with the same config is taken up where it ended.
+on one common field; and its uncertainty is turned into calibrated intervals of colour and depth.
+Started again it goes on with what is missing, also in a folder of `experiments.active_selection`
+with the same config.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from experiments import runtime, workdir
 from experiments.build import build_problem
 from experiments.build_scene import check_views, load_config_scene
 from experiments.schema import given_config
-from experiments.uncertain.measure import measure_seed, write_summary
+from experiments.uncertainty import measure_seed, write_summary
 
 FLAGS = flags.FLAGS
 runtime.define_cache_flags()

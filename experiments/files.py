@@ -186,7 +186,7 @@ def read_versioned(
 
 # --- pictures of several sizes in one array ---
 
-PICTURES = ("truth", "rgb", "error", "uncertainty", "depth")
+PICTURES = ("truth", "rgb", "error", "uncertainty", "depth", "half")
 
 
 def stack_pictures(images: list[np.ndarray]) -> np.ndarray:

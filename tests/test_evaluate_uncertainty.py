@@ -1,5 +1,6 @@
 """Uncertainty against error: errors of pixels, tables, and the script on a toy run."""
 
+import dataclasses
 import json
 import pathlib
 import subprocess
@@ -11,9 +12,13 @@ import pytest
 
 from bavs_jax.metrics.ause import sparsification
 from experiments.reporting.uncertainty import mean_curves
-from experiments.uncertain import measure
-from experiments.uncertain.intervals import calibration_path, load_calibration
-from experiments.uncertain.measure import row_path
+from experiments.uncertainty import (
+    all_ause,
+    load_calibration,
+    pixel_errors,
+    row_path,
+    whole_views,
+)
 from tests.toy_runs import toy_flags
 from tests.toy_scenes import toy_scene
 
@@ -21,22 +26,15 @@ ROOT = pathlib.Path(__file__).parents[1]
 SIZE = 6
 
 
-class SceneWithDepth:
-    """What `pixel_errors` asks of a scene, with a view that has no true depth."""
-
-    def __init__(self):
-        self.scene = toy_scene(size=SIZE)
-        self.depths = np.random.default_rng(0).uniform(1.0, 4.0, (12, SIZE, SIZE))
-        self.depths[:, 0] = 0.0  # not known
-
-    def image(self, view):
-        return self.scene.image(view)
-
-    def mask_image(self, view):
-        return None if view else np.arange(SIZE * SIZE).reshape(SIZE, SIZE) % 2 == 0
-
-    def depth_image(self, view):
-        return None if view == 3 else self.depths[view]
+def make_scene():
+    """With a mask in view 0, and a view that has no true depth."""
+    scene = toy_scene(size=SIZE)
+    depths = np.random.default_rng(0).uniform(1.0, 4.0, (scene.num_views, SIZE, SIZE))
+    depths[:, 0] = 0.0  # not known
+    depths[3] = 0.0
+    mask = np.ones((scene.num_views, SIZE * SIZE), bool)
+    mask[0, 1::2] = False
+    return dataclasses.replace(scene, depth=depths.ravel(), pixel_mask=mask.ravel())
 
 
 def images_of(scene, views, *, depth_factor=1.0):
@@ -44,55 +42,57 @@ def images_of(scene, views, *, depth_factor=1.0):
     return [
         {
             "rgb": scene.image(v) / 255.0 + 0.1,
-            "depth": depth_factor * scene.depths[v],
+            "depth": depth_factor * scene.depth_image(v),
             "uncertainty": rng.uniform(size=(SIZE, SIZE)),
         }
         for v in views
     ]
 
 
+def errors_of(scene, views, images, *, scale_depth=False):
+    return pixel_errors(whole_views(scene, views, images), scale_depth=scale_depth)
+
+
 def test_colour_errors_are_clipped_masked_means_over_channels():
-    scene = SceneWithDepth()
+    scene = make_scene()
     views = [0, 1, 3]
-    errors = measure.pixel_errors(scene, views, images_of(scene, views), scale_depth=False)
-    assert [len(e) for e, _ in errors["colour"]] == [18, 36, 36]
+    errors = errors_of(scene, views, images_of(scene, views))
+    assert [known.sum() for _, known in errors["colour"]] == [18, 36, 36]
     truth = scene.image(1) / 255.0
     expected = (np.clip(truth + 0.1, 0.0, 1.0) - truth).mean(-1).ravel()
     np.testing.assert_allclose(errors["colour"][1][0], expected, atol=1e-12)
 
 
 def test_depth_errors_leave_out_what_is_not_known_and_are_shares_of_the_largest():
-    scene = SceneWithDepth()
+    scene = make_scene()
     views = [0, 1, 3]
     images = images_of(scene, views, depth_factor=0.5)
-    errors = measure.pixel_errors(scene, views, images, scale_depth=False)["depth"]
-    assert [len(e) for e, _ in errors] == [15, 30, 0]
-    known = [scene.depths[0].ravel()[errors[0][1]], scene.depths[1].ravel()[errors[1][1]]]
-    largest = max(k.max() for k in known)
-    np.testing.assert_allclose(errors[1][0], 0.5 * known[1] / largest)
+    errors = errors_of(scene, views, images)["depth"]
+    assert [known.sum() for _, known in errors] == [15, 30, 0]
+    true = [scene.depth_image(view).ravel()[known] for view, (_, known) in zip(views, errors)]
+    largest = max(true[0].max(), true[1].max())
+    np.testing.assert_allclose(errors[1][0][errors[1][1]], 0.5 * true[1] / largest)
     # One factor for the scene takes a wrong unit out.
-    scaled = measure.pixel_errors(scene, views, images, scale_depth=True)["depth"]
-    np.testing.assert_allclose(np.concatenate([e for e, _ in scaled]), 0.0, atol=1e-12)
+    scaled = errors_of(scene, views, images, scale_depth=True)["depth"]
+    np.testing.assert_allclose(np.concatenate([e[k] for e, k in scaled]), 0.0, atol=1e-12)
 
 
 def test_a_scene_without_true_depth_has_colour_alone():
-    scene = SceneWithDepth()
-    errors = measure.pixel_errors(scene, [3], images_of(scene, [3]), scale_depth=False)
-    found = measure.all_ause(errors, images_of(scene, [3]))
+    scene = make_scene()
+    errors = errors_of(scene, [3], images_of(scene, [3]))
+    found = all_ause(errors, images_of(scene, [3]))
     assert errors.keys() == {"colour"} and len(found) == 6
 
 
 def test_depth_has_an_uncertainty_of_its_own_where_the_model_gives_one():
-    scene = SceneWithDepth()
+    scene = make_scene()
     images = images_of(scene, [1])
-    errors = measure.pixel_errors(
-        scene, [1], images_of(scene, [1], depth_factor=0.7), scale_depth=False
-    )
-    images[0]["depth_uncertainty"] = scene.depths[1]  # the order of the error itself
-    found = measure.all_ause(errors, images)
+    errors = errors_of(scene, [1], images_of(scene, [1], depth_factor=0.7))
+    images[0]["depth_uncertainty"] = scene.depth_image(1)  # the order of the error itself
+    found = all_ause(errors, images)
     assert found["depth_mae_per_image"].ause == 0.0
     e, known = errors["colour"][0]
-    expected = sparsification(e, images[0]["uncertainty"].ravel()[known]).ause
+    expected = sparsification(e[known], images[0]["uncertainty"].ravel()[known]).ause
     assert found["colour_mae_per_image"].ause == expected > 0.0
 
 
@@ -147,9 +147,9 @@ def test_script_writes_numbers_curves_and_a_page(finished):
     assert second["own"] != second["common"]
     assert first["psnr"] == first["psnr_common"] == second["psnr_common"] != second["psnr"]
     page = (base / "uncertainty.html").read_text()
-    assert page.count("<svg ") == 2 + 3 + 1 and "learned_variance" in page
-    assert page.count("<img ") == 2 * 4 + 4 and "remaining" in out
-    assert "sculpture (procedural scene, 16 x 16 pixels), 4 training views" in page
+    # Curves, coverage and tenths of both quantities, and one test view.
+    assert page.count("<svg ") == 2 + 4 + 1 and "learned_variance" in page
+    assert all(name in page for name in first["own"]) and "remaining" in out
 
 
 def test_intervals_are_of_views_that_nothing_was_trained_on(finished):
@@ -175,13 +175,14 @@ def test_intervals_are_of_views_that_nothing_was_trained_on(finished):
 
 def test_saved_intervals_give_the_bands_of_the_page(finished):
     base, *_ = finished
-    calibration = load_calibration(calibration_path(base, "laplace", 0))
-    with np.load(base / "uncertainty" / "laplace" / "seed_0.npz") as file:
-        half, quantity = file["band_half"], str(file["band_quantity"])
-    assert quantity == "depth" and np.isfinite(half).any()
-    factor = calibration.depth.factors[list(calibration.depth.levels).index(0.9)]
-    # All widths lie between those at the ends of the scale; single precision in the file.
-    ends = factor * (calibration.depth.scale.values[[0, -1]] + calibration.depth.scale.floor)
+    path = row_path(base, "laplace", 0)
+    colour = load_calibration(path.with_name("seed_0_calibration.json")).colour
+    with np.load(path.with_suffix(".npz")) as file:
+        half = file["half"]
+    assert half.shape == (1, 16, 16) and np.isfinite(half).any()
+    factor = colour.factors[list(colour.levels).index(0.9)]
+    # All widths lie between those at the ends of the scale.
+    ends = factor * (colour.scale.values[[0, -1]] + colour.scale.floor)
     known = half[np.isfinite(half)]
     assert (known >= ends[0] * (1 - 1e-6)).all() and (known <= ends[1] * (1 + 1e-6)).all()
 
@@ -202,7 +203,7 @@ def test_a_killed_evaluation_goes_on_and_does_nothing_twice(finished):
     code, out, err = run(base, models=str(models).replace(" ", ""))
     assert code == 0, err
     assert [path.stat().st_mtime_ns for path in done] == before
-    for words in ("train on", "train variance", "laplace", "entropy", "learned_variance"):
+    for words in ("train on", "train variance", "laplace", "learned_variance"):
         assert words not in out
     rows = json.loads((base / "uncertainty.json").read_text())["rows"]
     assert [row["model"] for row in rows] == list(models)

@@ -1,6 +1,5 @@
 """Fields that learn nothing begin anew, a stated number of times, and are never told as results."""
 
-import itertools
 from types import SimpleNamespace
 
 import jax
@@ -26,7 +25,6 @@ from experiments.build_trainer import train_aside
 from experiments.progress import track
 from experiments.reporting.results import Run
 from experiments.reporting.run_tables import final_table
-from experiments.suggest.choosing import train_field
 from tests.toy_rounds import run_round
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
@@ -145,39 +143,6 @@ def test_a_config_says_how_many_calls_there_are_and_when_a_field_is_looked_at():
         problem = build_problem(toy_config(**options), scene)
         for trainer in problem.trainers.values():
             assert (trainer.num_calls, trainer.check_call) == calls
-
-
-def test_a_capture_whose_field_was_stuck_goes_on_with_its_count_after_a_kill(tmp_path, capsys):
-    """The second attempt is cut off; started again, it ends as if it had not been."""
-    scene, config, ends = toy_scene(num_views=4, num_test=1), toy_config(**LONG), {}
-    for name, last in (("whole", None), ("cut", 5)):
-        init, call, _, keys = make_calls([1.0, 0.001])
-
-        def cut_call(*args, call=call, last=last, keys=keys):
-            if len(keys) == last:
-                keys.append(None)
-                raise KilledError
-            return call(*args)
-
-        attempts = itertools.count()
-
-        def init_train(key, attempts=attempts, init=init):
-            return init(key) if next(attempts) else fresh(0)
-
-        problem = SimpleNamespace(
-            scene=scene,
-            table=make_pixel_table(scene),
-            trainer=Trainer(init_train, cut_call, *LONG_CALLS),
-        )
-        if last:
-            with pytest.raises(KilledError):
-                train_field(config, problem, tmp_path / name, seed=0)
-        state = train_field(config, problem, tmp_path / name, seed=0)
-        ends[name] = state, [key for key in keys if key]
-    (whole, whole_keys), (cut, cut_keys) = ends["whole"], ends["cut"]
-    assert cut_keys == whole_keys and len(whole_keys) == 2 + 8
-    assert int(cut.model.params) == int(whole.model.params) == 1
-    assert "the field is stuck: trained anew with another key (1)" in capsys.readouterr().err
 
 
 def test_a_field_trained_aside_begins_anew_and_says_so(capsys):

@@ -6,21 +6,18 @@ import types
 import numpy as np
 import pytest
 
-from bavs_jax.uncertainty.bands import add_bands
+from bavs_jax.uncertainty.bands import add_bands, calibration_to_json
 from bavs_jax.uncertainty.conformal_scale import ViewGroups
 from experiments.errors import ConfigError, WorkdirError
-from experiments.reporting.uncertainty import band_strip, scanline_plot
-from experiments.uncertain.intervals import (
+from experiments.files import write_json
+from experiments.uncertainty import (
+    FittedModel,
     ViewSample,
-    band_arrays,
     calibrate_samples,
-    interval_views,
+    interval_groups,
     load_calibration,
     sample_views,
-    save_calibration,
-    split,
 )
-from experiments.uncertain.measure import load_images, save_images
 from tests.toy_scenes import toy_scene
 
 SIZE = 6
@@ -43,7 +40,7 @@ def make_sample(rng, *, num=50, factor=1.0):
         "uncertainty": uncertainty,
     }
     colour = 0.5 + 0.1 * uncertainty[:, None] * rng.uniform(-1.0, 1.0, (num, 3))
-    return ViewSample(image, colour, depth, None)
+    return ViewSample(image, {"colour": colour, "depth": depth}, np.ones(num, bool))
 
 
 def make_groups(rng, num, **options):
@@ -55,17 +52,18 @@ def make_groups(rng, num, **options):
 def test_test_views_come_first_and_training_views_never():
     scene = types.SimpleNamespace(pool=np.arange(10), test=np.arange(10, 14))
     is_training_view = np.isin(np.arange(16), (0, 3))  # with places for pictures to come
-    assert interval_views(scene, is_training_view, 2).tolist() == [10, 12]
-    assert interval_views(scene, is_training_view, 4).tolist() == [10, 11, 12, 13]
-    some = interval_views(scene, is_training_view, 7)
-    assert some.tolist() == [10, 11, 12, 13, 1, 4, 7]
+
+    def views(num, seed=0):
+        return sorted(np.concatenate(interval_groups(scene, is_training_view, num, seed)))
+
+    assert views(4) == [10, 11, 12, 13]
+    assert views(3) == [10, 11, 12] and views(7) == [1, 4, 7, 10, 11, 12, 13]
     for num in (0, 12, 100):
-        views = interval_views(scene, is_training_view, num)
-        assert sorted(views) == [1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13]
-    first, second = (split(scene, is_training_view, 0, seed) for seed in (0, 1))
+        assert views(num) == [1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13]
+    first, second = (interval_groups(scene, is_training_view, 0, seed) for seed in (0, 1))
     assert first.test.tolist() != second.test.tolist()
     with pytest.raises(ConfigError, match="num_interval_views: views: 2 are too few"):
-        split(scene, is_training_view, 2, 0)
+        interval_groups(scene, is_training_view, 2, 0)
 
 
 def test_pixels_are_drawn_by_view_alone_and_lie_where_they_should():
@@ -74,19 +72,20 @@ def test_pixels_are_drawn_by_view_alone_and_lie_where_they_should():
     def render_fn(rays):
         return {"origins": rays.origins, "directions": rays.directions}
 
-    samples, seconds = sample_views(scene, render_fn, [3, 5], 10, "toy")
-    again, _ = sample_views(scene, render_fn, [5], 10, "toy")
-    everything, _ = sample_views(scene, render_fn, [5], 0, "toy")
-    assert seconds > 0.0 and samples.keys() == {3, 5} and len(samples[3].colour) == 10
+    fitted = FittedModel(render_fn, 0.0)
+    samples = sample_views(scene, fitted, [3, 5], 10, "toy")
+    again = sample_views(scene, fitted, [5], 10, "toy")
+    everything = sample_views(scene, fitted, [5], 0, "toy")
+    assert samples.keys() == {3, 5} and len(samples[3].known) == 10
     for name, values in samples[5].image.items():
         np.testing.assert_array_equal(again[5].image[name], values)
-    np.testing.assert_array_equal(everything[5].depth, scene.depth_image(5).ravel())
+    np.testing.assert_array_equal(everything[5].truth["depth"], scene.depth_image(5).ravel())
     # Each drawn pixel has the direction, the colour and the depth of one and the same pixel.
     whole = everything[5]
     for i in range(10):
         same = (whole.image["directions"] == samples[5].image["directions"][i]).all(-1)
-        assert same.sum() == 1 and whole.depth[same] == samples[5].depth[i]
-        np.testing.assert_array_equal(whole.colour[same][0], samples[5].colour[i])
+        assert same.sum() == 1 and whole.truth["depth"][same] == samples[5].truth["depth"][i]
+        np.testing.assert_array_equal(whole.truth["colour"][same][0], samples[5].truth["colour"][i])
 
 
 def test_calibration_measures_the_test_views():
@@ -108,8 +107,8 @@ def test_pixels_without_a_band_are_counted_beside():
     for view in groups.test:
         samples[int(view)].image["opacity"][:10] = 0.0
         samples[int(view)].image["depth"][:10] = 0.0
-        samples[int(view)].depth[:10] = 3.0
-        samples[int(view)].depth[10:15] = 0.0  # not known
+        samples[int(view)].truth["depth"][:10] = 3.0
+        samples[int(view)].truth["depth"][10:15] = 0.0  # not known
     _, numbers = calibrate_samples(groups, samples, scale="isotonic", scale_depth=False)
     assert numbers["colour"]["share_with_band"] == pytest.approx(0.8)
     assert numbers["depth"]["share_with_band"] == pytest.approx(35 / 45)
@@ -131,7 +130,7 @@ def test_saved_calibration_puts_the_same_bands_around_new_views(tmp_path):
     groups, samples = make_groups(rng, 40)
     calibration, _ = calibrate_samples(groups, samples, scale="isotonic", scale_depth=False)
     path = tmp_path / "calibration.json"
-    save_calibration(path, calibration, {"scene": "toy", "seed": 0})
+    write_json(path, {"schema_version": 1, "calibration": calibration_to_json(calibration)})
     image = make_sample(rng).image
     before, after = (add_bands(c, image, 0.9) for c in (calibration, load_calibration(path)))
     for name, values in before.items():
@@ -154,41 +153,3 @@ def test_a_calibration_of_no_use_is_an_error_of_one_line(tmp_path, text, words):
         path.write_text(text)
     with pytest.raises(WorkdirError, match=words):
         load_calibration(path)
-
-
-def test_images_of_any_size_come_back_from_file(tmp_path):
-    rng = np.random.default_rng(5)
-    images = [
-        {"rgb": rng.uniform(size=(h, 4, 3)), "depth": rng.uniform(size=(h, 4))}
-        for h in (2, 3, *[1] * 9)
-    ]
-    save_images(tmp_path / "images.npz", images, 1.5)
-    read, seconds = load_images(tmp_path / "images.npz")
-    assert seconds == 1.5 and len(read) == len(images)
-    for before, after in zip(images, read):
-        assert before.keys() == after.keys()
-        for name, values in before.items():
-            np.testing.assert_array_equal(after[name], values)
-
-
-@pytest.mark.parametrize("has_depth", [True, False])
-def test_picture_shows_where_the_truth_is_outside(has_depth):
-    scene = scene_with_depth() if has_depth else toy_scene(size=SIZE)
-    groups, samples = make_groups(np.random.default_rng(6), 40)
-    calibration, _ = calibrate_samples(groups, samples, scale="constant", scale_depth=False)
-    image = {
-        "rgb": scene.image(2) / 255.0,
-        "depth": scene.depth_image(2).copy() if has_depth else np.ones((SIZE, SIZE)),
-        "opacity": np.ones((SIZE, SIZE)),
-        "uncertainty": np.ones((SIZE, SIZE)),
-    }
-    image["depth"][0] += 1.0  # errors are about 0.1 where it was calibrated
-    image["rgb"][0] = 1.0 - image["rgb"][0].round()
-    image["opacity"][1, 1] = 0.0
-    arrays = band_arrays(scene, calibration, 2, image)
-    assert str(arrays["band_quantity"]) == ("depth" if has_depth else "colour")
-    outside = np.abs(arrays["band_value"] - arrays["band_truth"]) > arrays["band_half"]
-    assert outside[0].all() and not outside[1:].any() and np.isnan(arrays["band_half"][1, 1])
-    strip = band_strip(arrays)
-    assert len(strip["images"]) == 4 and "blue, 82.9%" in strip["images"][3].caption  # 29 of 35
-    assert scanline_plot(arrays, "laplace").startswith("<svg ")

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from bavs_jax.cameras import Cameras, image_pixels, look_at, pixel_rays, take
 from bavs_jax.scenes import load_nerfstudio
 from bavs_jax.scenes.base import Scene, photo_cameras
-from bavs_jax.scenes.poses import user_transforms
 from experiments.acquisitions import CAMERA_FIELDS, write_next_views
-from experiments.suggest.results import write_transforms
+from experiments.reporting.suggestion import write_poses
 from tests.scene_files import edit_json, random_image, write_nerfstudio
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -90,12 +89,10 @@ def assert_same_rays(scene, cameras, folder):
 def test_suggested_views_come_back(tmp_path, lens):
     scene = turned_capture(tmp_path / "capture", lens)
     cameras, folder = free_cameras(scene), tmp_path / "next_views"
-    folder.mkdir()
     rows = [
         {"order": i + 1, "picked": NUM - i, "score": 0.5, "share_of_best": 1.0} for i in range(5)
     ]
-    poses = user_transforms(scene, cameras.world_from_cam)
-    write_transforms(folder / "transforms.json", poses, photo_cameras(scene, cameras), rows)
+    write_poses(folder, scene, cameras, rows)
     assert_same_rays(scene, cameras, folder)
 
 

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from bavs_jax.scenes import load_nerfstudio
-from experiments.evaluate import picture_arrays
-from experiments.files import cut_pictures, write_arrays
+from experiments.evaluate import image_arrays, picture_arrays
+from experiments.files import cut_pictures, stack_pictures, write_arrays
 from experiments.reporting import pictures
 from experiments.reporting.results import load_pictures, load_runs
-from experiments.reporting.uncertainty import view_strips
-from experiments.uncertain import measure
+from experiments.reporting.uncertainty import view_plots
 from tests.report_files import make_result, write_workdir
 from tests.scene_files import random_image, write_nerfstudio
 
@@ -58,13 +57,18 @@ def test_a_report_shows_each_view_at_its_own_size(scene, tmp_path):
 def test_the_page_of_uncertainties_shows_each_view_at_its_own_size(scene):
     shapes = [scene.image(view).shape for view in VIEWS]
     rng = np.random.default_rng(0)
-    images = [{"rgb": rng.random(s), "uncertainty": rng.random(s[:2])} for s in shapes]
-    arrays = measure.picture_arrays(scene, VIEWS, images, [0, 1, 2])
+    images = [
+        {"rgb": rng.random(s), "uncertainty": rng.random(s[:2]), "depth": rng.random(s[:2])}
+        for s in shapes
+    ]
+    halves = [image["depth"] for image in images]
+    arrays = image_arrays(scene, VIEWS, images) | {"half": stack_pictures(halves)}
     assert arrays["sizes"].tolist() == [[12, 8], [6, 4], [12, 8]]
     assert arrays["truth"].shape == (3, 8, 12, 3)
     cut = cut_pictures(arrays)
     assert [image.shape for image in cut["rgb"]] == shapes
-    assert len(view_strips("model", cut)) == 3
+    assert [image.shape for image in cut["half"]] == [shape[:2] for shape in shapes]
+    assert len(view_plots({"model": cut})) == 3
 
 
 def test_pictures_of_one_size_stay_arrays(scene):

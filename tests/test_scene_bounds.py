@@ -26,7 +26,7 @@ from bavs_jax.scenes import (
 from bavs_jax.scenes.base import printable
 from bavs_jax.scenes.pose_files import read_pose_file
 from bavs_jax.scenes.poses import rotation_between
-from experiments.suggest.places import gaze_between
+from experiments.suggestion import gaze_between
 from tests import scene_damage as do
 from tests.scene_files import edit_json, orbit, random_image, write_blender, write_llff
 from tests.scene_files import write_nerfstudio as write

@@ -19,7 +19,7 @@ from experiments.configs import base, quickstart
 from experiments.configs.paper import protocols
 from experiments.errors import ConfigError
 from experiments.schema import FLAG, SCHEMA, TEXT, check_config, leaves
-from experiments.suggest.choosing import default_config
+from experiments.suggestion import default_config
 from experiments.sweeps.axes import MAX_TRIALS, parse_axes
 from experiments.trained import saved_config
 from tests.toy_runs import OVERRIDES, toy_config

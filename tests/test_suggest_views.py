@@ -15,18 +15,20 @@ from scipy.spatial.transform import Rotation
 from bavs_jax.cameras import make_cameras, take
 from bavs_jax.placement.collect import PlacementError
 from bavs_jax.placement.seen import count_seeing
-from bavs_jax.scenes.poses import user_transforms
+from bavs_jax.scenes import SceneError
+from bavs_jax.scenes.poses import user_points, user_transforms
 from bavs_jax.selection.context import SelectionError
 from bavs_jax.selection.worth import Worth
-from experiments.suggest import choosing, page, places, results
+from experiments import suggestion
+from experiments.reporting.suggestion import worth_words, write_poses
 from tests.scene_files import orbit, write_nerfstudio
 from tests.toy_scenes import toy_scene
 
 ROOT = pathlib.Path(__file__).parents[1]
 
 
-def options(**changes) -> places.Options:
-    given = places.Options(
+def options(**changes) -> suggestion.Options:
+    given = suggestion.Options(
         num_views=3,
         policy="bavs",
         candidates="shell",
@@ -36,12 +38,11 @@ def options(**changes) -> places.Options:
         clearance=0.0,
         spread=0.25,
         gaze_jitter=5.0,
-        score_scale=0.5,
         route=False,
         start=None,
         seed=0,
     )
-    return dataclasses.replace(given, **changes)
+    return given._replace(**changes)
 
 
 def similar_scene():
@@ -62,48 +63,41 @@ def ball(points):
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"num_views": 0}, "--num_views"),
         ({"num_candidates": 2}, "--num_candidates"),
         ({"candidates": "box"}, "--bounds: is missing"),
         ({"candidates": "file"}, "--poses_file"),
         ({"poses_file": "a.csv"}, "--poses_file"),
         ({"start": np.zeros(3)}, "--start"),
-        ({"score_scale": 0.0}, "--score_scale"),
-        ({"gaze_jitter": 91.0}, "--gaze_jitter"),
+        ({"bounds": np.array([[1, 2, 3], [0, 5, 6]])}, "--bounds: each of"),
+        ({"candidates": "file", "poses_file": "/nowhere.csv"}, "/nowhere.csv"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(changes, message):
-    with pytest.raises(PlacementError, match=message):
-        places.check_options(options(**changes))
-    places.check_options(options())
+    with pytest.raises((PlacementError, SceneError), match=message):
+        suggestion.check_options(options(**changes))
+    suggestion.check_options(options())
 
 
-@pytest.mark.parametrize("text", ["1,2", "1,2,3,4,5,x", "1,2,3,0,5,6", "1,2,3,4,5,nan"])
-def test_bounds_that_are_no_box_are_refused(text):
-    with pytest.raises(PlacementError, match="--bounds"):
-        places.parse_bounds(text)
-    np.testing.assert_array_equal(places.parse_bounds("0,1,2, 3,4,5"), [[0, 1, 2], [3, 4, 5]])
-    assert places.parse_bounds("") is None
+@pytest.mark.parametrize("text", ["1,2", "1,2,3,4,5,x", "1,2,3,4,5,1e10", "1,2,3,4,5,nan"])
+def test_numbers_that_are_no_box_are_refused(text):
+    with pytest.raises(PlacementError, match=r"--bounds: .*give 6 numbers"):
+        suggestion.parse_numbers(text, (2, 3), "bounds")
+    found = suggestion.parse_numbers("0,1,2, 3,4,5", (2, 3), "bounds")
+    np.testing.assert_array_equal(found, [[0, 1, 2], [3, 4, 5]])
+    assert suggestion.parse_numbers("", (2, 3), "bounds") is None
 
 
 # --- candidates in the user's coordinates ---
 
 
-def test_points_go_to_the_user_and_back():
-    around = places.look_around(similar_scene(), options())
-    points = np.random.default_rng(0).normal(size=(5, 3))
-    np.testing.assert_allclose(around.to_scene(around.to_user(points)), points, atol=1e-12)
-    np.testing.assert_allclose(around.unit, 3.0)
-
-
 @pytest.mark.parametrize("kind", ["shell", "hemisphere", "box"])
 def test_candidates_stay_within_the_users_bounds_and_out_of_the_ball(kind):
     scene = similar_scene()
-    middle = places.look_around(scene, options()).to_user(np.zeros(3))
+    middle = user_points(scene, np.zeros(3))
     bounds = np.stack([middle - 9.0, middle + np.array([9.0, 9.0, 7.0])])
     chosen = options(candidates=kind, bounds=bounds, clearance=0.9, num_candidates=600)
-    around = places.look_around(scene, chosen)
-    got = places.propose(scene, ball, around, chosen)
+    around = suggestion.look_around(scene, chosen)
+    got = suggestion.propose(scene, ball, around, chosen)
     user = user_transforms(scene, got.poses)[:, :3, 3]
     assert len(got.poses) == 600
     assert (user >= bounds[0] - 1e-9).all() and (user <= bounds[1] + 1e-9).all()
@@ -124,34 +118,15 @@ def test_poses_from_a_file_are_read_in_the_users_coordinates(tmp_path):
     user = user_transforms(scene, np.asarray(scene.cameras.world_from_cam)[:5])
     (tmp_path / "reach.json").write_text(json.dumps(user.tolist()))
     chosen = options(candidates="file", poses_file=str(tmp_path / "reach.json"))
-    got = places.propose(scene, ball, places.look_around(scene, chosen), chosen)
+    got = suggestion.propose(scene, ball, suggestion.look_around(scene, chosen), chosen)
     np.testing.assert_allclose(got.poses, scene.cameras.world_from_cam[:5], atol=1e-5)
     assert got.num_drawn == 5
     with pytest.raises(PlacementError, match="list more poses"):
-        more = dataclasses.replace(chosen, num_views=6)
-        places.propose(scene, ball, places.look_around(scene, more), more)
+        more = chosen._replace(num_views=6)
+        suggestion.propose(scene, ball, suggestion.look_around(scene, more), more)
 
 
 # --- facts ---
-
-
-def test_bearing_is_that_of_someone_who_faces_the_focus():
-    scene = toy_scene()
-    around = dataclasses.replace(places.look_around(scene, options()), focus=np.zeros(3))
-    photos = np.array([[0.0, -3.0, 0.0]])  # stands in the south, looks north: left is west
-    assert "90° to the left" in page.bearing(np.array([-3.0, 0, 0]), photos, around, (0, 0, 1))
-    found = page.bearing(np.array([1.5, -1.5, 1.5 * math.sqrt(2)]), photos, around, (0, 0, 1))
-    assert "45° to the right" in found and "45° above" in found
-    all_around = np.array([[3.0, 0, 0], [-3, 0, 0], [0, 3, 0], [0, -3, 0]])
-    assert "all around" in page.bearing(np.array([1.0, 0, 0]), all_around, around, (0, 0, 1))
-
-
-def test_where_high_pixels_gather():
-    high = np.zeros((9, 12), bool)
-    assert page.gathered_where(high) is None
-    high[7:, :3] = True
-    assert page.gathered_where(high) == "lower left"
-    assert page.gathered_where(np.ones((9, 12), bool)) is None
 
 
 def test_photos_see_what_is_before_them_and_not_behind_the_ball():
@@ -169,15 +144,10 @@ def test_photos_see_what_is_before_them_and_not_behind_the_ball():
 
 def test_worth_in_words():
     worth = Worth(np.array([50.0, 30.0]), np.array([60.0, 55.0, 45.0]))
-    sentence = page.worth_sentence(worth, 40.0)
-    assert "75% of what the best would have told before (60 nats)" in sentence
-    assert "would tell 67%" in sentence
-    assert "less and less" in sentence
-    assert "good place to stop" in page.worth_sentence(worth, 44.0)
-    assert "still worth taking" in page.worth_sentence(worth, 10.0)
-    assert "no more than another photo" in page.worth_sentence(worth, 70.0)
+    words = worth_words(worth, 40.0)
+    assert "60 nats at first, after 2 picks 45 nats" in words and "40" in words
     nothing_left = Worth(np.array([60.0]), np.array([60.0, np.nan]))
-    assert "No candidate is left" in page.worth_sentence(nothing_left, 40.0)
+    assert "after 1 picks none" in worth_words(nothing_left, 40.0)
 
 
 # --- files ---
@@ -193,9 +163,7 @@ def written(tmp_path):
     rows = [
         {"order": i + 1, "picked": 3 - i, "score": 0.5, "share_of_best": 0.25 * i} for i in range(3)
     ]
-    results.write_transforms(tmp_path / "transforms.json", poses, cameras, rows)
-    results.write_camera_path(tmp_path / "camera_path.json", poses, cameras)
-    results.write_csv(tmp_path / "next_views.csv", poses, rows)
+    write_poses(tmp_path, dataclasses.replace(toy_scene(), cameras=cameras), cameras, rows)
     return tmp_path, poses
 
 
@@ -203,7 +171,7 @@ def test_transforms_parse_back(written):
     folder, poses = written
     data = json.loads((folder / "transforms.json").read_text())
     assert data["camera_model"] == "OPENCV"
-    np.testing.assert_allclose([f["transform_matrix"] for f in data["frames"]], poses)
+    np.testing.assert_allclose([f["transform_matrix"] for f in data["frames"]], poses, atol=1e-6)
     first = data["frames"][0]
     np.testing.assert_allclose([first[k] for k in ("k1", "p2", "fl_y", "h")], [0.1, 0.02, 32, 60])
 
@@ -214,7 +182,7 @@ def test_camera_path_has_the_viewers_form(written):
     assert {"camera_type", "render_height", "render_width", "fps", "seconds"} <= data.keys()
     assert data["camera_type"] == "perspective" and data["is_cycle"] is False
     for view, pose in zip(data["camera_path"], poses, strict=True):
-        np.testing.assert_allclose(np.reshape(view["camera_to_world"], (4, 4)), pose)
+        np.testing.assert_allclose(np.reshape(view["camera_to_world"], (4, 4)), pose, atol=1e-6)
         # nerfstudio: focal = height / 2 / tan(fov / 2), fov vertical in degrees.
         focal = 0.5 * data["render_height"] / math.tan(math.radians(view["fov"]) / 2)
         np.testing.assert_allclose([focal, view["aspect"]], [32.0, 40 / 60], rtol=1e-6)
@@ -227,12 +195,12 @@ def test_csv_parses_back(written):
     for row, pose in zip(rows, poses, strict=True):
         place = [float(row[k]) for k in ("x", "y", "z")]
         quaternion = [float(row[k]) for k in ("qx", "qy", "qz", "qw")]
-        np.testing.assert_allclose(place, pose[:3, 3], atol=1e-7)
+        np.testing.assert_allclose(place, pose[:3, 3], atol=1e-6)
         np.testing.assert_allclose(
-            Rotation.from_quat(quaternion).as_matrix(), pose[:3, :3], atol=1e-7
+            Rotation.from_quat(quaternion).as_matrix(), pose[:3, :3], atol=1e-6
         )
         look = [float(row[f"look_{k}"]) for k in "xyz"]
-        np.testing.assert_allclose(look, -pose[:3, 2], atol=1e-7)
+        np.testing.assert_allclose(look, -pose[:3, 2], atol=1e-6)
     assert [row["order"] for row in rows] == ["1", "2", "3"]
 
 
@@ -295,8 +263,8 @@ def test_script_writes_poses_that_agree_with_each_other(finished):
     assert (np.diff(summary["best_left"]) <= 1e-6).all()
     assert summary["worth"] and all(view["why"] for view in summary["views"])
     report = (base / "out" / "report.html").read_text()
-    assert "route of" in report and "PSNR" in report
-    assert "remaining" in out and "dropped" in out
+    assert "PSNR" in report and all(view["why"].split("; ")[1] for view in summary["views"])
+    assert "remaining" in out and "dropped" in out and "route: " in out
 
 
 def test_same_folder_uses_the_same_field_for_other_candidates_and_policies(finished):
@@ -310,17 +278,18 @@ def test_same_folder_uses_the_same_field_for_other_candidates_and_policies(finis
     assert (places_ >= [-6, -6, 0.5]).all() and (places_ <= [6, 6, 5]).all()
 
 
-def test_wrong_folder_ends_in_one_line(finished, tmp_path):
+@pytest.mark.parametrize("flag", ["--data=/nowhere", "--gaze_jitter=91", "--score_scale=0"])
+def test_a_flag_that_cannot_be_used_ends_in_one_line(finished, tmp_path, flag):
     _, usual, _ = finished
-    done = script(*usual, f"--workdir={tmp_path}", "--data=/nowhere")
-    assert done.returncode != 0 and "/nowhere" in done.stderr
-    assert "Traceback" not in done.stderr
+    done = script(*usual, f"--workdir={tmp_path}", flag)
+    assert done.returncode != 0 and all(word in done.stderr for word in flag.split("="))
+    assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_a_policy_that_is_unknown_or_needs_what_one_field_has_not_is_refused():
     for name in ("bavs", "directional", "coverage", "entropy"):
-        choosing.check_policy(name)
+        suggestion.check_options(options(policy=name))
     refused = {"bavz": "bavz", "oracle": "photos", "activenerf": "field of kind 'variance'"}
     for name, message in refused.items():
         with pytest.raises(SelectionError, match=message):
-            choosing.check_policy(name)
+            suggestion.check_options(options(policy=name))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from bavs_jax.uncertainty.model import Acquired
-from experiments.reporting.uncertainty_tables import load_result
-from experiments.uncertain import measure
-from experiments.uncertain.measure import row_path, write_summary
+from experiments import uncertainty
+from experiments.reporting.uncertainty import load_result
+from experiments.uncertainty import row_path, write_summary
 from tests.test_intervals import scene_with_depth
 from tests.toy_runs import toy_config
 
@@ -45,63 +45,63 @@ def place(tmp_path, monkeypatch):
     scene, log = scene_with_depth(size=12), []
     is_training_view = np.isin(np.arange(scene.num_views), (0, 1))
 
-    def trained(config, problem, folder, seed, command):
+    def train(config, problem, folder, policy, seed, command):
         log.append(f"train {seed}")
-        return Acquired({}, None, is_training_view, 288, label=f"seed {seed}")
+        return types.SimpleNamespace(acquired=Acquired({}, None, is_training_view, 288))
 
     def fit(problem, name, key, acquired):
         log.append(f"fit {name}")
-        return measure.FittedModel(make_render(name), 0.5)
+        return uncertainty.FittedModel(make_render(name), 0.5)
 
-    render_model = measure.render_model
+    render_model = uncertainty.render_model
 
     def render(scene, fitted, view_ids, label):
         log.append(f"render {label.split()[-1]}")
         return render_model(scene, fitted, view_ids, label)
 
-    monkeypatch.setattr(measure, "trained_views", trained)
-    monkeypatch.setattr(measure, "fit_model", fit)
-    monkeypatch.setattr(measure, "render_model", render)
+    monkeypatch.setattr(uncertainty, "train_run", train)
+    monkeypatch.setattr(uncertainty, "fit_model", fit)
+    monkeypatch.setattr(uncertainty, "render_model", render)
     return toy_config(**CONFIG), types.SimpleNamespace(scene=scene), tmp_path, log
 
 
 def test_each_step_is_done_once_wherever_it_is_killed(place, monkeypatch):
     config, problem, folder, log = place
-    whole_fit = measure.fit_model
+    whole_fit = uncertainty.fit_model
 
     def killed_fit(problem, name, key, acquired):
         if name == "ensemble":
             raise KeyboardInterrupt
         return whole_fit(problem, name, key, acquired)
 
-    monkeypatch.setattr(measure, "fit_model", killed_fit)
+    monkeypatch.setattr(uncertainty, "fit_model", killed_fit)
     with pytest.raises(KeyboardInterrupt):
-        measure.measure_seed(config, problem, folder, 0, "command")
+        uncertainty.measure_seed(config, problem, folder, 0, "command")
     # The common field is rendered once, and serves the model that renders just it.
     common = ["train 0", "fit entropy", "render entropy"]
-    assert log == [*common, "fit laplace", "render laplace", "fit entropy"]
+    assert log == [*common, "fit laplace", "render laplace"]
     before = {name: row_path(folder, name, 0).stat().st_mtime_ns for name in MODELS[:2]}
 
     log.clear()
-    monkeypatch.setattr(measure, "fit_model", whole_fit)
-    measure.measure_seed(config, problem, folder, 0, "command")
-    assert log == ["train 0", "fit ensemble", "render ensemble"]
+    monkeypatch.setattr(uncertainty, "fit_model", whole_fit)
+    uncertainty.measure_seed(config, problem, folder, 0, "command")
+    assert log == [*common, "fit ensemble", "render ensemble"]
     assert before == {name: row_path(folder, name, 0).stat().st_mtime_ns for name in MODELS[:2]}
 
     log.clear()
-    measure.measure_seed(config, problem, folder, 0, "command")
+    uncertainty.measure_seed(config, problem, folder, 0, "command")
     assert log == []
     # A row of an older version of this program is made anew.
     path = row_path(folder, "laplace", 0)
     path.write_text(json.dumps(json.loads(path.read_text()) | {"row_version": 1}))
-    measure.measure_seed(config, problem, folder, 0, "command")
-    assert log == ["train 0", "fit laplace", "render laplace"]
+    uncertainty.measure_seed(config, problem, folder, 0, "command")
+    assert log == [*common, "fit laplace", "render laplace"]
 
 
 def test_result_and_page_of_two_seeds(place):
     config, problem, folder, _ = place
     for seed in config.seeds:
-        measure.measure_seed(config, problem, folder, seed, "command")
+        uncertainty.measure_seed(config, problem, folder, seed, "command")
     numbers, page = write_summary(config, problem.scene, folder, "python -m x")
     result = load_result(folder)
     assert numbers.name == "uncertainty.json" and result["command"] == "python -m x"
@@ -116,15 +116,14 @@ def test_result_and_page_of_two_seeds(place):
         # Five views cannot promise 90 %: 5 / 6 is the most.
         assert shown["mean_width"][2:] == [None, None] and shown["mean_width"][0] > 0.0
         assert shown["share_with_band"] < 1.0 and shown["error_without_band"] > 0.0
-    text = page.read_text()
-    assert "ball (procedural scene, 12 x 12 pixels), 2 training views, 24 optimiser steps" in text
+    assert "Uncertainty against error: ball" in page.read_text()
 
 
 def test_page_of_a_scene_without_depth(place):
     config, problem, folder, _ = place
     problem.scene = dataclasses.replace(problem.scene, depth=None)
     config.seeds = (0,)
-    measure.measure_seed(config, problem, folder, 0, "command")
+    uncertainty.measure_seed(config, problem, folder, 0, "command")
     write_summary(config, problem.scene, folder, "python -m x")
     result = load_result(folder)
     assert result["rows"][0]["intervals"].keys() == {"colour"}

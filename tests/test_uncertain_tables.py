@@ -6,16 +6,15 @@ import pytest
 
 from experiments.errors import ReportError
 from experiments.reporting.tables import Table
-from experiments.reporting.uncertainty import title
-from experiments.reporting.uncertainty_tables import (
+from experiments.reporting.uncertainty import (
     CONSTANT,
-    SCHEMA_VERSION,
-    ause_table,
+    RESULT_VERSION,
     coverage_table,
     known_variants,
     load_result,
     save_result,
     summary_table,
+    variants_table,
 )
 from experiments.tables import result_tables
 
@@ -72,7 +71,7 @@ def make_rows():
 def make_result():
     splits = {str(s): {"fit": [0, 1], "calibration": [2, 3, 4], "test": [5]} for s in (0, 1, 7)}
     return {
-        "schema_version": SCHEMA_VERSION,
+        "schema_version": RESULT_VERSION,
         "scene": "procedural",
         "kind": "procedural",
         "image_size": [100, 80],
@@ -89,14 +88,15 @@ def cells_of(table):
     return {row[0].text: dict(zip(table.head, (cell.text for cell in row))) for row in table.rows}
 
 
-def test_table_of_a_variant_is_paired_by_seed():
+def test_every_variant_has_a_row_for_each_field_and_normalisation():
     rows = make_rows()
     assert "depth_mae_pooled" in known_variants(rows) and len(known_variants(rows)) == 4
-    table = ause_table(rows, "depth_mae_pooled")
-    cells = {row[0].text: row for row in table.rows}
-    assert cells["entropy"][-1].text == "+0.300 ± 0.000 (p < 0.001)"
-    assert cells["laplace"][-1].text == "—" and cells["cf_nerf"][-1].why.endswith("share no seed")
-    assert cells["laplace"][2].text == "20.50 ± 6.35"  # 12.706 / sqrt(2) * sqrt(0.5)
+    cells = cells_of(variants_table(rows))
+    assert len(cells) == 4 * 2 * 2
+    common = cells["depth_mae_pooled, common field"]
+    # Half of the interval of two seeds: 12.706 / sqrt(2) * sqrt(0.5) * 0.01.
+    assert common["laplace"] == "0.205 ± 0.064" and common["cf_nerf"] == "0.300"
+    assert cells["depth_mae_pooled, own field, unnormalised"]["laplace"] == "0.0200 ± 0.0000"
 
 
 def test_summary_has_a_row_for_each_model_and_field():
@@ -107,6 +107,9 @@ def test_summary_has_a_row_for_each_model_and_field():
     assert own["entropy"]["depth: minus laplace"] == "+0.200 ± 0.000 (p < 0.001)"
     assert own["cf_nerf"]["PSNR of the field (dB)"] == "27.00"
     assert [row[1].text for row in common] == ["common field"] * 3
+    assert own["laplace"]["PSNR of the field (dB)"] == "20.50 ± 6.35"
+    assert own["laplace"]["depth: minus laplace"] == "—"
+    assert common[2][5].why.endswith("share no seed")
     assert common[1][3].text == "22.00 ± 0.00" and common[1][5].text == "+0.300 ± 0.000 (p < 0.001)"
 
 
@@ -145,13 +148,6 @@ def test_file_gives_the_numbers_back_and_its_tables(tmp_path):
     text = result_tables(tmp_path)
     assert text.startswith("`python -m x` (CPU;") and text.count("| laplace |") == 3
     assert "2 views fit the scale, 3 calibrate and 1 test" in text
-
-
-def test_title_names_scene_views_and_seeds():
-    assert title(make_result()) == (
-        "sculpture (procedural scene, 100 x 80 pixels), 20 training views, 1600 optimiser steps, "
-        "3 seeds (0, 1, 7)"
-    )
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ from bavs_jax.uncertainty.model import Acquired
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from experiments.build import build_problem
 from experiments.build_scene import load_config_scene
-from experiments.suggest.choosing import photo_rays
 from tests.toy_rounds import silent
 from tests.toy_runs import toy_config
 
@@ -139,8 +138,6 @@ def test_masked_pixels_are_not_counted(masked):
         np.testing.assert_array_equal(num_training_pixels(scene, TAKEN), by_hand)
     assert sum(by_hand) == len(training_pixels(problem.table, acquired.is_training_view)[0])
     assert problem.acquisition("bavs", TAKEN, "").num_rays == sum(by_hand)
-    pool = [mask[offsets[v] : offsets[v + 1]].sum() for v in problem.scene.pool]
-    assert photo_rays(problem) == sum(pool)
 
 
 def test_looks_leave_masked_pixels_out(masked):

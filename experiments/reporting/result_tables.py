@@ -11,7 +11,7 @@ import numpy as np
 from experiments.bench import results as bench
 from experiments.bench.same_numbers import DEVICE_FILE, differences_table
 from experiments.errors import ReportError
-from experiments.reporting import run_tables, stats, uncertainty_tables
+from experiments.reporting import run_tables, stats, uncertainty
 from experiments.reporting.results import Run, load_runs, policies_of, read_result
 from experiments.reporting.tables import Collected, Table, interval_cell
 from experiments.sweeps.plan import FILE as SWEEP_FILE
@@ -125,12 +125,12 @@ def _collected(
 
 def _uncertainty(path: pathlib.Path) -> Collected:
     """How well uncertainty tells error, and how well calibrated intervals hold."""
-    result = uncertainty_tables.load_result(path.parent)
+    result = uncertainty.load_result(path.parent)
     rows = result["rows"]
-    tables = {"ause": uncertainty_tables.summary_table(rows)}
-    for quantity in uncertainty_tables.known_quantities(rows):
-        tables[f"{quantity}_intervals"] = uncertainty_tables.coverage_table(rows, quantity)
-    split = uncertainty_tables.split_words(result)
+    tables = {"ause": uncertainty.summary_table(rows)}
+    for quantity in uncertainty.known_quantities(rows):
+        tables[f"{quantity}_intervals"] = uncertainty.coverage_table(rows, quantity)
+    split = uncertainty.split_words(result)
     note = f"Intervals: {split}. Coverage ± its standard error over the test views."
     return Collected(f"`{result['command']}` ({result['device']}; {INTERVALS})", tables, (note,))
 
@@ -212,7 +212,7 @@ def _line(name: str, by_seed, digits: int, *, gap: bool = False) -> list:
 
 
 FILES: dict[str, Callable[[pathlib.Path], Collected]] = {
-    uncertainty_tables.NAME: _uncertainty,
+    uncertainty.NAME: _uncertainty,
     DEVICE_FILE: _device,
     bench.BENCHMARK: bench.benchmark_tables,
     bench.QUALITY: bench.quality_tables,

@@ -1,145 +1,265 @@
-"""The page of `evaluate_uncertainty`: sparsification, coverage, and views with their bands."""
+"""`uncertainty.json`, its tables and its page: how well uncertainty tells error."""
 
 from __future__ import annotations
 
+import json
 import pathlib
 
 import numpy as np
 from markupsafe import Markup
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedFormatter, FixedLocator, PercentFormatter
+from matplotlib.ticker import PercentFormatter
 
-from bavs_jax.metrics.ause import removal_fractions
-from experiments.files import cut_pictures
-from experiments.reporting import plots
-from experiments.reporting.page import FOLDER, write_template
+from bavs_jax.metrics.ause import removal_fractions, variant_name
+from experiments.errors import ReportError
+from experiments.files import cut_pictures, write_atomic
+from experiments.reporting import page, plots, stats
+from experiments.reporting.page import Section
 from experiments.reporting.pictures import (
     ERROR_LIMIT,
     ERROR_MAP,
     UNCERTAINTY_MAP,
-    Picture,
-    colourise,
-    png_uri,
-    shrink,
+    Panel,
+    panel_table,
 )
-from experiments.reporting.uncertainty_tables import (
-    FIELDS,
-    QUANTITIES,
-    ause_table,
-    coverage_table,
-    interval_values,
-    known_quantities,
-    known_variants,
-    models_of,
-    split_words,
-    summary_table,
-)
+from experiments.reporting.results import read_result
+from experiments.reporting.tables import Cell, Table, dash, interval_cell
 
-MAX_SIDE = 240  # pixels of a picture
+RESULT_VERSION = 2
+NAME = "uncertainty.json"
+FIELDS = {"own": "the model's own field", "common": "one common field"}
+QUANTITIES = {"depth": "scene units", "colour": "of 0 to 1"}  # that have intervals, and the unit
+CONSTANT = "constant width"  # the intervals that need no uncertainty
 LEVEL = 0.9  # of the bands that are shown
 SPREAD = 0.62  # of the distance between two levels that the models of one level fill
-DEPTH_MAP = "viridis"
-# Blue is inside, vermilion outside, grey without a truth or a band.
-INSIDE, OUTSIDE, UNKNOWN = (0, 114, 178), (213, 94, 0), (190, 194, 200)
+
+
+# --- the file ---
+
+
+def load_result(folder: pathlib.Path) -> dict:
+    """`uncertainty.json` of a folder.
+
+    Raises:
+      ReportError: the file is missing or broken, or of another version.
+    """
+    result = read_result(folder / NAME, RESULT_VERSION, made_by="evaluation")
+    if not result.get("rows"):
+        raise ReportError(f"{folder / NAME}: rows: there are none; run the evaluation again")
+    return result
+
+
+def save_result(folder: pathlib.Path, result: dict) -> None:
+    """Writes `uncertainty.json`: six digits, one line for each row, so that it stays small."""
+    text = json.dumps(result, allow_nan=False)
+    rounded = json.loads(text, parse_float=lambda digits: float(f"{float(digits):.6g}"))
+    parts = {name: json.dumps(value) for name, value in rounded.items()}
+    parts["rows"] = "[\n" + ",\n".join(map(json.dumps, rounded["rows"])) + "\n]"
+    text = ",\n".join(f"{json.dumps(name)}: {part}" for name, part in parts.items())
+    write_atomic(folder / NAME, lambda file: file.write(f"{{\n{text}\n}}\n".encode()))
+
+
+def split_words(result: dict) -> str:
+    """How many views fit, calibrate and test the intervals, in words."""
+    splits = result["interval_views"].values()
+    fit, calibration, test = (
+        "/".join(map(str, sorted({len(split[name]) for split in splits})))
+        for name in ("fit", "calibration", "test")
+    )
+    return (
+        f"{fit} views fit the scale, {calibration} calibrate and {test} test, none of them trained "
+        "on, drawn at random for each seed"
+    )
+
+
+def models_of(rows: list[dict]) -> list[str]:
+    """Each model once, in the order of the rows."""
+    return list(dict.fromkeys(row["model"] for row in rows))
+
+
+def known_variants(rows: list[dict]) -> list[str]:
+    """Variants of AUSE that every row has."""
+    return [name for name in rows[0]["own"] if all(name in row["own"] for row in rows)]
+
+
+def known_quantities(rows: list[dict]) -> list[str]:
+    """What every row has intervals of."""
+    return [q for q in QUANTITIES if all(q in row["intervals"] for row in rows)]
+
+
+def interval_mean(rows: list[dict], model: str, quantity: str, key: str) -> np.ndarray:
+    """Mean over seeds of a measure of `coverage_report` [L, ...]; NaN where it is infinite."""
+    found = [row["intervals"][quantity][key] for row in rows if row["model"] == model]
+    return np.array(found, np.float64).mean(0)
+
+
+# --- tables ---
+
+
+def summary_table(rows: list[dict]) -> Table:
+    """Each model on its own field and on the common one: PSNR, AUSE of depth and of colour.
+
+    Models are compared with the Laplace approximation seed by seed, or with the first one.
+    """
+    models = models_of(rows)
+    first = "laplace" if "laplace" in models else models[0]
+    head = ["model", "measured on", "seeds", "PSNR of the field (dB)"]
+    for of in ("depth", "colour"):
+        head += [f"AUSE {of} MAE", f"{of}: minus {first}", f"AUSE {of} MAE, unnorm."]
+    table = []
+    for field, words, psnr in (
+        ("own", "its own field", "psnr"),
+        ("common", "common field", "psnr_common"),
+    ):
+        for model in models:
+            psnrs = [row[psnr] for row in rows if row["model"] == model]
+            cells = [Cell(model), Cell(words), Cell(str(len(psnrs)))]
+            cells.append(interval_cell(stats.mean_interval(psnrs), 2, ""))
+            for of in ("depth", "colour"):
+                variant = variant_name(of=of, error="mae", pooled=False)
+                cells.append(_ause_cell(rows, model, field, variant))
+                cells.append(_gap_cell(rows, model, first, field, variant))
+                cells.append(_ause_cell(rows, model, field, variant, "unnormalised"))
+            table.append(tuple(cells))
+    return Table(tuple(head), tuple(table))
+
+
+def variants_table(rows: list[dict]) -> Table:
+    """Every variant of AUSE of each model, on its own field and on the common one."""
+    models, table = models_of(rows), []
+    for variant in known_variants(rows):
+        for field in FIELDS:
+            for key in ("ause", "unnormalised"):
+                name = f"{variant}, {field} field{', unnormalised' * (key != 'ause')}"
+                cells = [_ause_cell(rows, model, field, variant, key) for model in models]
+                table.append((Cell(name), *cells))
+    return Table(("AUSE", *models), tuple(table))
+
+
+def coverage_table(rows: list[dict], quantity: str) -> Table:
+    """Share of test pixels inside their interval, and widths against one width for all pixels."""
+    levels = rows[0]["intervals"][quantity]["levels"]
+    names = ", ".join(f"{level:.0%}" for level in levels)
+    head = [f"intervals of {quantity}", *(f"covered at {level:.0%} (%)" for level in levels)]
+    head += [
+        f"mean half-width at {levels[-2]:.0%} ({QUANTITIES[quantity]})",
+        f"width / constant's at {names}",
+        f"interval score / constant's at {names}",
+    ]
+    table, keys = [], ("coverage", "coverage_stderr", "mean_width", "width_ratio", "score_ratio")
+    for model in models_of(rows):
+        means = (interval_mean(rows, model, quantity, key) for key in keys)
+        table.append(_coverage_row(model, *means))
+    first, ones = models_of(rows)[0], np.ones(len(levels))
+    shares, widths = (
+        interval_mean(rows, first, quantity, f"constant_{key}") for key in ("coverage", "width")
+    )
+    table.append(_coverage_row(CONSTANT, shares, np.nan * ones, widths, ones, ones))
+    return Table(tuple(head), tuple(table))
+
+
+def _coverage_row(name: str, shares, errors, widths, *ratios) -> tuple[Cell, ...]:
+    cells = [Cell(name)]
+    for share, error in zip(shares, errors):  # per cent, with the standard error over test views
+        more = "" if np.isnan(error) else f" ± {100.0 * error:.1f}"
+        cells.append(Cell(f"{100.0 * share:.1f}{more}"))
+    for values, digits in ((0.5 * widths[-2:-1], 4), *((ratio, 2) for ratio in ratios)):
+        texts = [f"{value:.{digits}f}" if np.isfinite(value) else "—" for value in values]
+        why = None if np.isfinite(values).all() else "too few calibration views for this level"
+        cells.append(Cell(" / ".join(texts), why))
+    return tuple(cells)
+
+
+def _values(rows: list[dict], model: str, field: str, variant: str, key: str = "ause") -> dict:
+    """By seed, one number of a model."""
+    mine = [row for row in rows if row["model"] == model]
+    return {row["seed"]: row[field][variant][key] for row in mine if variant in row[field]}
+
+
+def _ause_cell(rows, model: str, field: str, variant: str, key: str = "ause") -> Cell:
+    found = stats.mean_interval(_values(rows, model, field, variant, key).values())
+    digits = 3 if key == "ause" else 4
+    return interval_cell(found, digits, f"{variant.split('_')[0]}: this scene has no true one")
+
+
+def _gap_cell(rows, model: str, first: str, field: str, variant: str) -> Cell:
+    if model == first:
+        return dash("a model does not differ from itself")
+    ours, theirs = (_values(rows, name, field, variant) for name in (first, model))
+    if not theirs:
+        return _ause_cell(rows, model, field, variant)
+    gap = stats.mean_interval(theirs[s] - ours[s] for s in sorted(ours.keys() & theirs.keys()))
+    return interval_cell(gap, 3, f"{model} and {first} share no seed", gap=True)
+
+
+# --- the page ---
 
 
 def write_page(path: pathlib.Path, result: dict, *, arrays: dict, variant: str) -> None:
-    """Curves, tables of every variant, calibrated intervals, and pictures of some views.
+    """Curves of a variant of AUSE, tables of all, calibrated intervals, and pictures of some views.
 
-    Args:
-      path: where to.
-      result: what the result file holds.
-      arrays: by model, the arrays of each seed; pictures are those of the first seed.
-      variant: the AUSE that is shown first.
+    `arrays` are by model those of each seed; pictures are of the first seed.
     """
     rows = result["rows"]
-    variants = known_variants(rows)
-    variant = variant if variant in variants else variants[0]
+    variant = variant if variant in known_variants(rows) else known_variants(rows)[0]
     pictures = {model: cut_pictures(found[0]) for model, found in arrays.items()}
-    shown = models_of(rows)[0]
-    write_template(
-        path,
-        FOLDER / "uncertainty.html",
-        title=title(result),
-        result=result,
-        variant=variant,
-        summary=summary_table(rows),
-        plots=[curve_plot(arrays, field, variant) for field in FIELDS],
-        variants=[(name, ause_table(rows, name)) for name in variants],
-        split=split_words(result),
-        coverage=[coverage_table(rows, quantity) for quantity in known_quantities(rows)],
-        coverage_plots=[coverage_plot(rows), width_plot(rows), decile_plot(rows)],
-        left_out=_left_out_words(rows),
-        shown=shown,
-        band=band_strip(pictures[shown]),
-        scanline=scanline_plot(pictures[shown], shown),
-        strips=[strip for model in pictures for strip in view_strips(model, pictures[model])],
+    sections = [
+        Section(
+            "Does uncertainty tell where the field is wrong?",
+            summary_table(rows),
+            "Pixels of test views are taken away, the most uncertain first. AUSE is the area "
+            "between the error of what is left and the same in the order of the true error "
+            f"(dotted), 0 at best; as a share of the larger maximum, or not (unnorm.). Means over "
+            f"seeds ± half of the 95 % interval. Curves: {variant}, as a share of the largest.",
+            [curve_plot(arrays, field, variant) for field in FIELDS],
+        ),
+        Section("Every variant of AUSE", variants_table(rows)),
+        *(_interval_section(result, quantity) for quantity in known_quantities(rows)),
+        Section(
+            "Some test views",
+            note=f"Colour error and half-width at {LEVEL:.0%}: 0 (dark) to {ERROR_LIMIT}; blank: "
+            "no band. Uncertainty: up to the 99th percentile of the model's pixels.",
+            plots=view_plots(pictures),
+        ),
+    ]
+    title = f"Uncertainty against error: {result['scene']}"
+    page.write_page(path, title=title, made=result, sections=sections)
+
+
+def _interval_section(result: dict, quantity: str) -> Section:
+    rows, scale = result["rows"], result["config"]["evaluation"]["interval_scale"]
+    note = (
+        f"Prediction ± factor x scale(uncertainty), {scale} scale, by split-conformal calibration: "
+        f"{split_words(result)}. Pixels: {result['pixel_rule']}. ±: standard error over test "
+        "views. Widths and scores relative to one constant width beat it below 1."
     )
+    charts = [coverage_plot(rows, quantity), decile_plot(rows, quantity)]
+    return Section(f"Intervals of {quantity}", coverage_table(rows, quantity), note, charts)
 
 
-def title(result: dict) -> str:
-    """What was measured, in plain words."""
-    rows, config = result["rows"], result["config"]
-    width, height = result["image_size"]
-    # The scene that comes with the project is called like its loader.
-    scene = config["scene"] if result["kind"] == result["scene"] else result["scene"]
-    kind = {"procedural": "procedural scene", "blender": "NeRF-synthetic scene"}
-    kind = kind.get(result["kind"], f"scene of the {result['kind']} layout")
-    seeds = sorted({row["seed"] for row in rows})
-    views = [row["num_views"] for row in rows]
-    fewest, most = min(views), max(views)
-    return (
-        f"{scene} ({kind}, {width} x {height} pixels), "
-        f"{fewest}{f' to {most}' if most > fewest else ''} training views, "
-        f"{config['train']['num_steps']} optimiser steps, "
-        f"{len(seeds)} seed{'s' * (len(seeds) > 1)} ({', '.join(map(str, seeds))})"
-    )
-
-
-def _left_out_words(rows: list[dict]) -> str:
-    """How many test pixels have no interval, and how wrong they are, of the first model."""
-    model, parts = rows[0]["model"], []
-    for quantity in known_quantities(rows):
-        share, error = (
-            interval_values(rows, model, quantity, key)
-            for key in ("share_with_band", "error_without_band")
-        )
-        known = error[np.isfinite(error)]
-        mean = f", mean error {known.mean():.3g} {QUANTITIES[quantity]}" if known.size else ""
-        parts.append(f"{quantity} {1.0 - share.mean():.1%}{mean}")
-    return f"Pixels with a known truth but without an interval ({model}): {'; '.join(parts)}."
-
-
-# --- sparsification and coverage ---
+def _axes() -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(5.6, 4.0))
+    axes = figure.add_subplot()
+    plots.tidy(axes, "y")
+    return figure, axes
 
 
 def curve_plot(curves: dict[str, list[dict]], field: str, variant: str) -> Markup:
     """Error of the pixels that are left, for each model, against what is taken away.
 
-    Args:
-      curves: by model, the arrays of each seed.
-      field: "own" or "common".
-      variant: which AUSE.
+    `curves` are by model the arrays of each seed; `field` is one of `FIELDS`.
     """
-    figure = Figure(figsize=(6.2, 4.2))
-    axes = figure.add_subplot()
+    figure, axes = _axes()
     for model, (colour, marker) in plots.policy_style(list(curves)).items():
         by_uncertainty, best = mean_curves(curves[model], field, variant)
         fractions = removal_fractions(len(best))
         look = {"linewidth": 2.0, "marker": marker, "markevery": (3, 14), "markersize": 5}
         axes.plot(fractions, by_uncertainty, color=colour, label=model, **look, **plots.DOT)
-        if field == "own":
-            axes.plot(fractions, best, color=colour, linewidth=1.0, linestyle=":")
-    if field == "common":
-        look = {"color": plots.GREY, "linestyle": "--", "label": "order of the true error"}
-        axes.plot(fractions, best, **look)
-    axes.set_xlabel("pixels taken away, the most uncertain first")
+        axes.plot(fractions, best, color=colour, linewidth=1.0, linestyle=":")
     words = f"Error of what is left, {FIELDS[field]}"
-    axes.set_title(words)
+    axes.set(title=words, xlabel="pixels taken away", xlim=(0.0, 1.0), ylim=(0.0, None))
     axes.xaxis.set_major_formatter(PercentFormatter(1.0))
-    axes.set_xlim(0.0, 1.0)
-    axes.set_ylim(0.0, None)
-    plots.tidy(axes, "y")
     axes.legend()
     return plots.to_svg(figure, salt=f"curve-{field}", label=words)
 
@@ -148,206 +268,72 @@ def mean_curves(arrays: list[dict], field: str, variant: str) -> tuple[np.ndarra
     """Mean over seeds of both curves, each seed divided by its own largest value."""
     pairs = []
     for one in arrays:
-        a, b = (one[f"{field}_{variant}_by_{what}"] for what in ("uncertainty", "error"))
-        largest = max(a.max(), b.max(), 1e-12)
-        pairs.append((a / largest, b / largest))
-    return tuple(np.mean(curves, axis=0) for curves in zip(*pairs))
+        pair = np.stack([one[f"{field}_{variant}_by_{by}"] for by in ("uncertainty", "error")])
+        pairs.append(pair / max(pair.max(), 1e-12))
+    return tuple(np.mean(pairs, axis=0))
 
 
-def coverage_plot(rows: list[dict]) -> Markup:
-    """Coverage less the nominal level, with two standard errors over test views; a panel each."""
-    figure, panels = _panels(rows, 1, 0.0)
-    for axes, quantity in zip(panels[0], known_quantities(rows)):
-        levels = rows[0]["intervals"][quantity]["levels"]
-        num_views = rows[0]["intervals"][quantity]["num_calibration_views"]
-        axes.axhspan(-2.0, 2.0, color="#f1f5f9", zorder=0)
-        for model, colour, marker, x in _positions(rows, levels):
-            shares, errors = (
-                interval_values(rows, model, quantity, key).mean(0)
-                for key in ("coverage", "coverage_stderr")
-            )
-            look = {"color": colour, "marker": marker, "markersize": 5.5, "linestyle": "none"}
-            bars = {"yerr": 200.0 * np.nan_to_num(errors), "elinewidth": 1.4, "capsize": 2.5}
-            axes.errorbar(x, 100.0 * (shares - levels), label=model, **look, **bars)
-        axes.set_title(f"{quantity}: coverage from {num_views} views")
-        _level_axis(axes, levels)
-    panels[0, 0].set_ylabel("coverage − nominal (percentage points)")
-    return _finish(
-        figure, panels, "nominal level", "coverage", "Coverage against the nominal level"
-    )
-
-
-def width_plot(rows: list[dict]) -> Markup:
-    """Mean width and interval score as shares of those of one width for all pixels."""
-    figure, panels = _panels(rows, 2, 1.0)
-    names = (("width_ratio", "mean width"), ("score_ratio", "interval score"))
-    for row, (key, words) in zip(panels, names):
-        for axes, quantity in zip(row, known_quantities(rows)):
-            levels, top = rows[0]["intervals"][quantity]["levels"], 1.0
-            for model, colour, marker, x in _positions(rows, levels):
-                ratios = interval_values(rows, model, quantity, key)
-                axes.plot(x, ratios.mean(0), marker, color=colour, markersize=6, label=model)
-                axes.vlines(x, ratios.min(0), ratios.max(0), color=colour, linewidth=1.4)
-                top = np.nanmax([top, *ratios.ravel()])
-            axes.set_title(f"{quantity}: {words}")
-            axes.set_ylim(0.0, 1.08 * top)
-            _level_axis(axes, levels)
-        row[0].set_ylabel("share of constant width's")
-    return _finish(figure, panels, "nominal level", "width", "Widths and interval scores")
-
-
-def decile_plot(rows: list[dict]) -> Markup:
-    """Coverage at `LEVEL` in each tenth of the pixels, from the least uncertain up."""
-    figure, panels = _panels(rows, 1, 100.0 * LEVEL)
-    style, tenths = plots.policy_style(models_of(rows)), np.arange(1, 11)
-    for axes, quantity in zip(panels[0], known_quantities(rows)):
-        levels = np.array(rows[0]["intervals"][quantity]["levels"])
-        row = int(np.argmin(np.abs(levels - LEVEL)))
-        first = next(iter(style))
-        constant = interval_values(rows, first, quantity, "constant_decile_coverage").mean(0)[row]
-        look = {"color": plots.GREY, "linestyle": ":", "linewidth": 2.0}
-        axes.plot(tenths, 100.0 * constant, label=f"constant width, by {first}", **look)
-        for model, (colour, marker) in style.items():
-            shares = interval_values(rows, model, quantity, "decile_coverage").mean(0)[row]
-            look = {"color": colour, "marker": marker, "markersize": 5, "linewidth": 1.6}
-            axes.plot(tenths, 100.0 * shares, label=model, **look, **plots.DOT)
-        axes.set_title(f"{quantity}: coverage at {LEVEL:.0%} by uncertainty")
-        axes.xaxis.set_major_locator(FixedLocator(tenths))
-    panels[0, 0].set_ylabel("coverage (%)")
-    words = "tenth of the pixels, least uncertain first"
-    return _finish(figure, panels, words, "deciles", "Coverage in each tenth of the pixels")
-
-
-def _panels(rows: list[dict], num_rows: int, line: float):
-    """A column of panels for each quantity, with a dashed line across."""
-    num = len(known_quantities(rows))
-    figure = Figure(figsize=(5.3 * num, 0.7 + 3.1 * num_rows))
-    panels = figure.subplots(num_rows, num, squeeze=False)
-    for axes in panels.flat:
-        axes.axhline(line, color=plots.BLACK, linewidth=1.2, linestyle="--")
-        plots.tidy(axes, "y")
-    return figure, panels
-
-
-def _positions(rows: list[dict], levels):
-    """Each model with colour, marker and where it stands beside the others at each level."""
+def coverage_plot(rows: list[dict], quantity: str) -> Markup:
+    """Coverage less the nominal level, with two standard errors over test views."""
+    levels = np.array(rows[0]["intervals"][quantity]["levels"])
+    figure, axes = _axes()
+    axes.axhline(0.0, color=plots.BLACK, linewidth=1.2, linestyle="--")
     style = plots.policy_style(models_of(rows))
     for number, (model, (colour, marker)) in enumerate(style.items()):
-        offset = SPREAD * ((number + 0.5) / len(style) - 0.5)
-        yield model, colour, marker, np.arange(len(levels)) + offset
+        x = np.arange(len(levels)) + SPREAD * ((number + 0.5) / len(style) - 0.5)
+        shares, errors = (
+            interval_mean(rows, model, quantity, key) for key in ("coverage", "coverage_stderr")
+        )
+        bars = {"yerr": 200.0 * np.nan_to_num(errors), "elinewidth": 1.4, "capsize": 2.5}
+        look = {"color": colour, "marker": marker, "markersize": 5.5, "linestyle": "none"}
+        axes.errorbar(x, 100.0 * (shares - levels), label=model, **look, **bars)
+    axes.set(title="Coverage minus level (percentage points)", xlabel="level")
+    axes.set_xticks(range(len(levels)), [f"{level:.0%}" for level in levels])
+    axes.legend()
+    return plots.to_svg(figure, salt=f"coverage-{quantity}", label=f"Coverage of {quantity}")
 
 
-def _level_axis(axes, levels) -> None:
-    axes.xaxis.set_major_locator(FixedLocator(range(len(levels))))
-    axes.xaxis.set_major_formatter(FixedFormatter([f"{level:.0%}" for level in levels]))
-    axes.set_xlim(-0.5, len(levels) - 0.5)
-
-
-def _finish(figure: Figure, panels, xlabel: str, salt: str, label: str) -> Markup:
-    """One legend for all panels, and what is below the last of them."""
-    for axes in panels[-1]:
-        axes.set_xlabel(xlabel)
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=6)
-    return plots.to_svg(figure, salt=salt, label=label)
-
-
-# --- one test view with its band, and pictures ---
-
-
-def band_strip(arrays: dict[str, np.ndarray]) -> dict:
-    """Render, half-width, error on the same scale, and where the truth is outside.
-
-    Args:
-      arrays: with those of `band_arrays`.
-    """
-    value, half, truth = (arrays[f"band_{name}"] for name in ("value", "half", "truth"))
-    quantity, error = str(arrays["band_quantity"]), np.abs(value - truth)
-    unit = QUANTITIES[quantity]
-    low, high = _ends(np.where(np.isfinite(truth), value, np.nan), 1.0)
-    top = max(_ends(half, 2.0)[1], 1e-12)
-    known = np.isfinite(error)
-    verdict = np.where(known, np.where(error <= half, 0, 1), 2)
-    share = f"{np.mean(error[known] <= half[known]):.1%}" if known.any() else "no pixel"
-    shown = {
-        f"rendered {quantity}, {low:.2f} (dark) to {high:.2f} (bright) {unit}": colourise(
-            value, low, high, DEPTH_MAP
-        ),
-        f"half-width at {LEVEL:.0%}, 0 to {top:.3g} {unit} (bright)": colourise(
-            half, 0.0, top, UNCERTAINTY_MAP
-        ),
-        "error, on the scale of the half-width": colourise(error, 0.0, top, UNCERTAINTY_MAP),
-        f"truth inside (blue, {share}) or outside (vermilion)": np.array(
-            [INSIDE, OUTSIDE, UNKNOWN], np.uint8
-        )[verdict],
-    }
-    images = [Picture(png_uri(image), caption) for caption, image in shown.items()]
-    return {"name": str(arrays["band_name"]), "quantity": quantity, "images": images}
-
-
-def scanline_plot(arrays: dict[str, np.ndarray], model: str) -> Markup:
-    """The image row with the most known pixels: render, band and truth along it."""
-    value, half, truth = (arrays[f"band_{name}"] for name in ("value", "half", "truth"))
-    known = np.isfinite(value) & np.isfinite(truth)
-    row = int(known.sum(-1).argmax())
-    quantity = str(arrays["band_quantity"])
-    x, known, value, half, truth = (
-        np.arange(value.shape[1]),
-        *(array[row] for array in (known, value, half, truth)),
+def decile_plot(rows: list[dict], quantity: str) -> Markup:
+    """Coverage at `LEVEL` in each tenth of the pixels, from the least uncertain up."""
+    levels = np.array(rows[0]["intervals"][quantity]["levels"])
+    at, tenths = int(np.argmin(np.abs(levels - LEVEL))), np.arange(1, 11)
+    figure, axes = _axes()
+    axes.axhline(100.0 * LEVEL, color=plots.BLACK, linewidth=1.2, linestyle="--")
+    first, *_ = models = models_of(rows)
+    constant = interval_mean(rows, first, quantity, "constant_decile_coverage")[at]
+    look = {"color": plots.GREY, "linestyle": ":", "linewidth": 2.0}
+    axes.plot(tenths, 100.0 * constant, label=f"constant width, by {first}", **look)
+    for model, (colour, marker) in plots.policy_style(models).items():
+        shares = interval_mean(rows, model, quantity, "decile_coverage")[at]
+        look = {"color": colour, "marker": marker, "markersize": 5, "linewidth": 1.6}
+        axes.plot(tenths, 100.0 * shares, label=model, **look, **plots.DOT)
+    axes.set(
+        title=f"Coverage at {LEVEL:.0%} (%)", xlabel="tenth of the pixels, least uncertain first"
     )
-    is_outside = np.abs(value - truth) > half
-    figure = Figure(figsize=(10.6, 3.3))
-    axes = figure.add_subplot()
-    look = {"color": plots.SKY, "alpha": 0.45, "linewidth": 0, "step": "mid"}
-    axes.fill_between(x, value - half, value + half, label=f"band at {LEVEL:.0%}", **look)
-    look = {"color": plots.BLUE, "linewidth": 1.6, "where": "mid"}
-    axes.step(x, value, label=f"rendered {quantity}", **look)
-    for chosen, colour, marker, label in (
-        (~is_outside, plots.BLACK, ".", "truth, inside"),
-        (is_outside, plots.VERMILION, "x", "truth, outside"),
-    ):
-        axes.plot(x[chosen], truth[chosen], marker, color=colour, markersize=5, label=label)
-    ends = _ends(np.stack([value - half, value + half])[:, known], 2.0)
-    ends = (np.nanmin([ends[0], *truth[known]]), np.nanmax([ends[1], *truth[known]]))
-    if np.isfinite(ends).all() and ends[0] < ends[1]:
-        margin = 0.06 * (ends[1] - ends[0])
-        axes.set_ylim(ends[0] - margin, ends[1] + margin)
-    if known.any():
-        axes.set_xlim(x[known][0] - 2.5, x[known][-1] + 2.5)
-    unit = "scene units" if quantity == "depth" else "farthest channel, 0 to 1"
-    axes.set_xlabel(f"pixel of image row {row}")
-    axes.set_ylabel(f"{quantity} ({unit})")
-    axes.set_title(f"{model}: one row of {arrays['band_name']}")
-    plots.tidy(axes, "y")
-    axes.legend(ncols=4, loc="lower left", bbox_to_anchor=(0.45, 1.0))
-    return plots.to_svg(figure, salt="scanline", label="Band and truth along an image row")
+    axes.set_xticks(tenths)
+    axes.legend()
+    return plots.to_svg(
+        figure, salt=f"deciles-{quantity}", label=f"Coverage of {quantity} by tenths"
+    )
 
 
-def _ends(values, percent: float) -> tuple[float, float]:
-    """A low and a high percentile of the finite values; 0 and 1 of none."""
-    values = values[np.isfinite(values)]
-    if not values.size:
-        return 0.0, 1.0
-    return tuple(float(v) for v in np.percentile(values, (percent, 100.0 - percent)))
+# --- pictures ---
 
 
-def view_strips(model: str, arrays: dict[str, np.ndarray]) -> list[dict]:
-    """For each view: truth, render, error and uncertainty on the model's own scale.
-
-    Args:
-      model: its name.
-      arrays: of one seed; without pictures if none were asked for.
-    """
-    strips = []
-    for i, name in enumerate(arrays.get("names", ())):
-        top = np.percentile(np.concatenate([u.ravel() for u in arrays["uncertainty"]]), 99.0)
-        error, uncertainty = arrays["error"][i], arrays["uncertainty"][i]
-        shown = {
-            "truth": arrays["truth"][i],
-            "render": arrays["rgb"][i],
-            "colour error": colourise(error, 0.0, ERROR_LIMIT, ERROR_MAP),
-            "uncertainty": colourise(uncertainty, 0.0, top, UNCERTAINTY_MAP),
-        }
-        images = [Picture(png_uri(shrink(image, MAX_SIDE)), c) for c, image in shown.items()]
-        strips.append({"name": f"{model}, {name}", "images": images})
-    return strips
+def view_plots(pictures: dict[str, dict]) -> list[Markup]:
+    """Of each test view with pictures: truth, render, error and uncertainty of every model."""
+    drawn, first = [], next(iter(pictures.values()))
+    for i, name in enumerate(first.get("names", ())):
+        rows = []
+        for model, arrays in pictures.items():
+            top = np.percentile(np.concatenate([u.ravel() for u in arrays["uncertainty"]]), 99.0)
+            panels = [
+                Panel("truth", arrays["truth"][i] / 255.0),
+                Panel("render", arrays["rgb"][i] / 255.0),
+                Panel("colour error", arrays["error"][i], ERROR_MAP, (0.0, ERROR_LIMIT)),
+                Panel("half-width", arrays["half"][i], ERROR_MAP, (0.0, ERROR_LIMIT)),
+                Panel("uncertainty", arrays["uncertainty"][i], UNCERTAINTY_MAP, (0.0, top)),
+            ]
+            rows.append((model, panels))
+        drawn.append(plots.to_svg(panel_table(rows), salt=f"view-{i}", label=f"Test view {name}"))
+    return drawn

@@ -1,1 +1,0 @@
-"""Where to stand next: the parts of `python -m experiments.suggest_views`."""

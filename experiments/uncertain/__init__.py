@@ -1,1 +1,0 @@
-"""How well uncertainty tells error: parts of `experiments.evaluate_uncertainty`."""
