@@ -19,7 +19,7 @@ from bavs_jax.uncertainty.draws import (
     noise_scale,
 )
 from bavs_jax.uncertainty.posterior import default_prior_weight, posterior_precision
-from experiments.posthoc.draws import ViewDraws, farthest_view, largest_offset, spread_measures
+from experiments.posthoc.draws import farthest_view, largest_offset, spread_measures
 from tests.toy_fields import (
     NOTHING_LEARNT,
     even_sampler,
@@ -138,20 +138,18 @@ def test_measures_are_over_covered_pixels():
     """Two pixels with matter, of which the more uncertain one moves more, and an empty one."""
     draws = np.zeros((2, 1, 3, 3))
     draws[1, 0, 0], draws[1, 0, 1] = 0.1, 0.3
-    view = ViewDraws(
-        0,
-        rgb=np.zeros((1, 3, 3)),
-        opacity=np.array([[1.0, 0.9, 0.0]]),
-        uncertainty=np.array([[0.3, 0.6, 0.9]]),
-        draws=draws,
-    )
+    view = {
+        "opacity": np.array([[1.0, 0.9, 0.0]]),
+        "uncertainty": np.array([[0.3, 0.6, 0.9]]),
+        "draws": draws,
+    }
     measures = spread_measures([view, view])
     assert measures["num_views"] == 2 and measures["num_covered_pixels"] == 4
     # Of two values 0 and x the unbiased standard deviation is x / sqrt(2).
     np.testing.assert_allclose(measures["spread"], 0.2 / np.sqrt(2), rtol=1e-5)
     np.testing.assert_allclose(measures["spread_all"], 0.4 / 3 / np.sqrt(2), rtol=1e-5)
     np.testing.assert_allclose(measures["rank_correlation"], 1.0)
-    nothing = spread_measures([view._replace(opacity=np.zeros((1, 3)))])
+    nothing = spread_measures([view | {"opacity": np.zeros((1, 3))}])
     assert nothing["spread"] is None and nothing["rank_correlation"] is None
 
 
