@@ -50,10 +50,8 @@ flags.DEFINE_integer("num_test", 50, "Test views, evenly spaced; 0: all.", 0)
 def clean_run(run: TrainedRun) -> dict:
     """One run's numbers; writes its picture."""
     setup, unit = run.problem.setup, float(offset_unit(run.problem.scene.box))
-    variance, look = (
-        run.variance(),
-        {key: getattr(setup.laplace, key) for key in ("variant", "extent")},
-    )
+    variance = run.variance()
+    look = {"variant": setup.laplace.variant, "extent": setup.laplace.extent}
     render = make_cleaned_render_fn(setup.model, setup.grid, **look)
 
     def cleaned(thresholds) -> Callable:

@@ -14,11 +14,12 @@ import numpy as np
 from absl import flags
 from matplotlib.figure import Figure
 
+from bavs_jax.fields.deformation import cell_sides
 from bavs_jax.uncertainty.draws import colour_deviation
 from experiments import runtime
 from experiments.evaluate import evenly_spaced
 from experiments.posthoc import script
-from experiments.posthoc.draws import draw_views, farthest_view, largest_offset, spread_measures
+from experiments.posthoc.draws import draw_views, farthest_view, spread_measures
 from experiments.reporting.pictures import Panel, panel_table
 from experiments.reporting.plots import save_figure
 from experiments.trained import TrainedRun
@@ -47,7 +48,7 @@ def draw_run(run: TrainedRun) -> dict:
         np.concatenate([seen, held_out]),
         num_draws=FLAGS.num_draws,
         scale=FLAGS.scale,
-        limit=largest_offset(run.problem.grid, FLAGS.limit),
+        limit=FLAGS.limit * cell_sides(run.problem.grid),
     )
     split = {"training": views[: len(seen)], "test": views[len(seen) :]}
     split["farthest"] = [view for view in split["test"] if view["view_id"] == far]

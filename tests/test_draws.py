@@ -10,7 +10,7 @@ import pytest
 
 from bavs_jax.cameras import Rays
 from bavs_jax.fields.base import Field
-from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.fields.deformation import DeformationGrid, cell_sides
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 from bavs_jax.uncertainty.draws import (
     colour_deviation,
@@ -19,7 +19,7 @@ from bavs_jax.uncertainty.draws import (
     noise_scale,
 )
 from bavs_jax.uncertainty.posterior import default_prior_weight, posterior_precision
-from experiments.posthoc.draws import farthest_view, largest_offset, spread_measures
+from experiments.posthoc.draws import farthest_view, spread_measures
 from tests.toy_fields import (
     NOTHING_LEARNT,
     even_sampler,
@@ -219,11 +219,12 @@ def test_what_was_photographed_stays_and_the_far_side_moves(spread_of_side):
     assert np.quantile(unseen, 0.1) > np.median(seen)
 
 
-def test_farthest_view_and_largest_offset():
+def test_farthest_view_and_sides_of_a_cell():
     scene = toy_scene()  # 12 views on a ring
-    state = SimpleNamespace(table=SimpleNamespace(cameras=scene.cameras))
-    run = SimpleNamespace(state=state, training_views=np.arange(4))
+    table = SimpleNamespace(cameras=scene.cameras)
+    state = SimpleNamespace(table=table, is_training_view=np.arange(scene.num_views) < 4)
+    run = SimpleNamespace(state=state)
     assert farthest_view(run, np.arange(4, 12)) in (7, 8)  # opposite to the views 0 .. 3
     # Four cells along a side of 2; in contracted space the box is the middle half of the grid.
-    np.testing.assert_allclose(largest_offset(GRID, 0.5), 0.25)
-    np.testing.assert_allclose(largest_offset(GRID.replace(contracted=True), 0.5), 0.5)
+    np.testing.assert_allclose(0.5 * cell_sides(GRID), 0.25)
+    np.testing.assert_allclose(0.5 * cell_sides(GRID.replace(contracted=True)), 0.5)

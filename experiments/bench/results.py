@@ -7,7 +7,7 @@ import pathlib
 import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, FuncFormatter, NullFormatter, NullLocator
+from matplotlib.ticker import EngFormatter, NullFormatter, NullLocator
 
 from experiments.reporting import plots
 from experiments.reporting.page import Section, write_page
@@ -153,7 +153,7 @@ def growth_plot(result: dict) -> Markup:
     """Seconds against size, both on log scales, with the straight line; linear has a slope of 1."""
     growth = result["growth"]
     num_rows = -(-len(growth) // PANELS)
-    figure = Figure(figsize=(4.0 * PANELS, 3.4 * num_rows), layout="constrained")
+    figure = Figure(figsize=(4.0 * PANELS, 3.4 * num_rows))
     panels = figure.subplots(num_rows, PANELS, squeeze=False).flat
     for row, axes in zip(growth.values(), panels):
         sizes, times, fit = np.array(row["sizes"]), np.array(row["median_s"]), row["fit"]
@@ -166,14 +166,14 @@ def growth_plot(result: dict) -> Markup:
             proportional = times[-1] * steps / sizes[-1]
             axes.plot(steps, proportional, color=plots.PALE, linewidth=1.0, label="in proportion")
             title += f"\ntime ~ n^{fit['exponent']:.2f}"
-        axes.plot(sizes, times, "o", color=plots.BLUE, markeredgecolor="white", label="measured")
+        axes.plot(sizes, times, "o", color=plots.BLUE, label="measured", **plots.DOT)
         axes.set(xscale="log", yscale="log")
         # Room above and below, so that a time which does not grow looks like one.
         axes.set_ylim(min(times.min() / 2, times.max() / 8), times.max() * 2)
         axes.set_xticks(sizes, [f"{size:,}" for size in sizes], rotation=30, ha="right")
         axes.xaxis.set_minor_locator(NullLocator())
         axes.yaxis.set_minor_formatter(NullFormatter())
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{1e3 * value:g} ms"))
+        axes.yaxis.set_major_formatter(EngFormatter("s"))
         axes.set_xlabel(f"n: {row['size']}")
         axes.set_title(title)
         plots.tidy(axes)
@@ -186,7 +186,7 @@ def growth_plot(result: dict) -> Markup:
 def quality_plot(result: dict) -> Markup:
     """PSNR on test views against seconds since the process was started."""
     runs = result["runs"]
-    figure = Figure(figsize=(6.2, 4.2), layout="constrained")
+    figure = Figure(figsize=(6.2, 4.2))
     axes = figure.add_subplot()
     for target in next(iter(runs.values()))["seconds_to_db"]:
         axes.axhline(float(target), color=plots.PALE, linewidth=1.0)

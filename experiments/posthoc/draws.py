@@ -8,8 +8,8 @@ import jax
 import numpy as np
 from scipy.stats import spearmanr
 
-from bavs_jax.fields.deformation import DeformationGrid, vertex_positions
 from bavs_jax.metrics.covered import MIN_OPACITY
+from bavs_jax.selection.distances import nearest_distances
 from bavs_jax.uncertainty.draws import (
     colour_deviation,
     draw_offsets,
@@ -23,17 +23,8 @@ from experiments.trained import TrainedRun
 
 def farthest_view(run: TrainedRun, view_ids) -> int:
     """The view whose camera is farthest from its nearest training camera."""
-    positions = np.asarray(run.state.table.cameras.positions)
-    gaps = positions[view_ids][:, None] - positions[run.training_views]
-    return int(view_ids[np.argmax(np.linalg.norm(gaps, axis=-1).min(-1))])
-
-
-def largest_offset(grid: DeformationGrid, cells: float) -> np.ndarray:
-    """The sides of `cells` cells in the middle of the deformation grid, [3] scene units."""
-    side, middle = grid.cells + 1, grid.cells // 2
-    places = np.asarray(vertex_positions(grid)).reshape(side, side, side, 3)
-    ahead = places[middle + 1, middle + 1, middle + 1]
-    return cells * (ahead - places[middle, middle, middle])
+    positions, is_training = run.state.table.cameras.positions, run.state.is_training_view
+    return int(view_ids[nearest_distances(positions[view_ids], positions, is_training).argmax()])
 
 
 def draw_views(
