@@ -26,12 +26,12 @@ from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.training.fit import Trainer, is_stuck, single_colour_error
 from bavs_jax.training.train import TrainInfo, TrainState
+from bavs_jax.uncertainty.channel import make_render_chunk_fn
 from bavs_jax.uncertainty.measures import make_true_error_fn
 from bavs_jax.uncertainty.model import RECONSTRUCTION, LaplaceOptions, ModelFns, SceneSetup
 from bavs_jax.uncertainty.models import MODELS
 from bavs_jax.uncertainty.models.laplace import laplace_variance
 from bavs_jax.uncertainty.posterior import default_prior_weight
-from bavs_jax.uncertainty.scoring import make_render_chunk_fn
 from bavs_jax.uncertainty.streaming import CurvatureOfRays, curvature_group_size
 from experiments.build_field import build_flow
 from experiments.build_scene import make_source
@@ -93,19 +93,7 @@ class Problem:
         variance = None
         if jac_sq_sum is not None:
             variance = laplace_variance(jac_sq_sum, num_rays, self.laplace)
-        return partial(self._render_chunk, train.model, variance)
-
-    @cached_property
-    def _render_chunk(self) -> Callable:
-        options = self.laplace
-        return make_render_chunk_fn(
-            self.model,
-            self.grid,
-            variant=options.variant,
-            scale=options.scale,
-            extent=options.extent,
-            mesh=self.mesh,
-        )
+        return partial(self.setup.render_chunk, train.model, variance)
 
     def density(self, train: TrainState, positions) -> jax.Array:
         """At points [K, 3]: [K] 1 / scene unit, 0 where nothing is rendered."""
@@ -136,6 +124,14 @@ class Problem:
                 self.grid,
                 group_size=curvature_group_size(self.grid.num_vertices, len(self.table.cameras)),
                 track=self.track,
+                mesh=self.mesh,
+            ),
+            render_chunk=make_render_chunk_fn(
+                self.model,
+                self.grid,
+                variant=self.laplace.variant,
+                scale=self.laplace.scale,
+                extent=self.laplace.extent,
                 mesh=self.mesh,
             ),
             train=train,

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 
 import numpy as np
 
 from bavs_jax.fields.base import DensityField, Field
-from bavs_jax.fields.flow_field import FlowField, make_flow_field, make_flow_mlp_field
-from bavs_jax.fields.hash_grid import make_hash_grid_density, make_hash_grid_field
-from bavs_jax.fields.nerf_mlp import make_mlp_density, make_nerf_mlp_field
+from bavs_jax.fields.flow_field import FlowField, FlowOptions, make_flow_field, make_flow_mlp_field
+from bavs_jax.fields.hash_grid import (
+    HashGridOptions,
+    make_hash_grid_density,
+    make_hash_grid_field,
+)
+from bavs_jax.fields.nerf_mlp import NerfMlpOptions, make_mlp_density, make_nerf_mlp_field
 from bavs_jax.fields.positional import PIXEL_TO_RADIUS
 from bavs_jax.rendering.coarse_to_fine import make_coarse_to_fine_sampler
 from bavs_jax.rendering.proposals import make_proposal_sampler
@@ -67,38 +72,36 @@ def build_field(
 
 
 def _make_field(config, scene: Scene, num_views: int, learned_variance: bool) -> Field:
-    common = {"learned_variance": learned_variance}
     if config.field_kind == "hash_grid":
         return make_hash_grid_field(
-            scene.box, contracted=scene.unbounded, num_views=num_views, **config.hash_grid, **common
+            scene.box,
+            HashGridOptions(**config.hash_grid),
+            contracted=scene.unbounded,
+            num_views=num_views,
+            learned_variance=learned_variance,
         )
-    if config.field_kind == "nerf_mlp":
-        return make_nerf_mlp_field(
-            scene.box, contracted=scene.unbounded, **config.nerf_mlp, **common
-        )
-    options = config.mip_mlp
     return make_nerf_mlp_field(
         scene.box,
-        depth=options.depth,
-        width=options.width,
-        skip=options.skip,
-        position_degree=options.position_degree,
-        direction_degree=options.direction_degree,
-        pixel_radius=_pixel_radius(scene),
-        **common,
+        _mlp_options(config),
+        contracted=scene.unbounded,
+        pixel_radius=_pixel_radius(scene) if config.field_kind == "mip_mlp" else None,
+        learned_variance=learned_variance,
     )
+
+
+def _mlp_options(config) -> NerfMlpOptions:
+    options = config[config.field_kind]
+    names = [field.name for field in dataclasses.fields(NerfMlpOptions)]
+    return NerfMlpOptions(**{name: options[name] for name in names})
 
 
 def build_flow(config, scene: Scene) -> FlowField:
     """The distribution over fields that goes with a config's kind of field."""
-    common = {"contracted": scene.unbounded, **config.flow}
+    flow = FlowOptions(**config.flow)
     if config.field_kind == "hash_grid":
-        aside = ("appearance_features", "initial_optical_depth")
-        grid = {k: v for k, v in config.hash_grid.items() if k not in aside}
-        return make_flow_field(scene.box, **grid, **common)
-    trunk = config[config.field_kind]
-    shape = {k: trunk[k] for k in ("depth", "width", "skip", "position_degree", "direction_degree")}
-    return make_flow_mlp_field(scene.box, **shape, **common)
+        grid = HashGridOptions(**config.hash_grid)
+        return make_flow_field(scene.box, grid, flow, contracted=scene.unbounded)
+    return make_flow_mlp_field(scene.box, _mlp_options(config), flow, contracted=scene.unbounded)
 
 
 def _pixel_radius(scene: Scene) -> float:
@@ -137,7 +140,7 @@ def _occupancy_sampler(options, scene: Scene) -> Sampler:
 def _coarse_to_fine_sampler(config, scene: Scene) -> Sampler:
     options = config.coarse_to_fine
     return make_coarse_to_fine_sampler(
-        make_nerf_mlp_field(scene.box, contracted=scene.unbounded, **config.nerf_mlp),
+        make_nerf_mlp_field(scene.box, _mlp_options(config), contracted=scene.unbounded),
         _interval_fn(scene, config.proposal.far),
         background=field_background(scene),
         num_coarse=options.num_coarse,
@@ -164,11 +167,13 @@ def _proposal_fields(config, scene: Scene) -> list[DensityField]:
     return [
         make_hash_grid_density(
             scene.box,
-            num_levels=options.num_levels,
-            coarsest=options.coarsest,
-            finest=finest,
-            log2_table_size=options.log2_table_size,
-            width=options.width,
+            HashGridOptions(
+                num_levels=options.num_levels,
+                coarsest=options.coarsest,
+                finest=finest,
+                log2_table_size=options.log2_table_size,
+                width=options.width,
+            ),
             contracted=scene.unbounded,
         )
         for finest in options.finest

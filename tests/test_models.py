@@ -9,11 +9,11 @@ from bavs_jax.cameras import reduced_cameras, take
 from bavs_jax.models.losses import gaussian_nll
 from bavs_jax.pixel_table import view_pixel_rays
 from bavs_jax.policy_inputs import WEIGHTING, make_candidate_curvature_fn, training_looks
+from bavs_jax.uncertainty.channel import mean_uncertainty
 from bavs_jax.uncertainty.measures import make_true_error_fn
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired
 from bavs_jax.uncertainty.models import MODELS, get_model
 from bavs_jax.uncertainty.models.laplace import training_curvature
-from bavs_jax.uncertainty.scoring import mean_uncertainty
 from experiments.build import RENDER_CHUNK, build_problem
 from experiments.build_scene import initial_views, load_config_scene
 from tests.toy_rounds import silent

@@ -22,8 +22,8 @@ from bavs_jax.scenes import Scene
 from bavs_jax.selection.batch import acquire
 from bavs_jax.selection.context import make_context
 from bavs_jax.selection.policies import get_policy
+from bavs_jax.uncertainty.channel import mean_uncertainty
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired
-from bavs_jax.uncertainty.scoring import mean_uncertainty
 from bavs_jax.uncertainty.streaming import table_rays
 from experiments.build import RENDER_CHUNK, build_problem
 from experiments.build_scene import initial_views
