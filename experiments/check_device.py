@@ -18,57 +18,46 @@ import jax
 from absl import flags
 
 from experiments import runtime
-from experiments.bench.same_numbers import (
-    DEVICE_FILE,
-    FIELDS,
-    check_field,
-    differences_table,
-    too_large,
-)
+from experiments.bench import same_numbers
 from experiments.errors import ConfigError
 from experiments.files import write_json
-from experiments.reporting.tables import FORMATS
-from experiments.runtime import device_name, versions
+from experiments.reporting.tables import markdown
 
 FLAGS = flags.FLAGS
 flags.DEFINE_string("workdir", None, "Folder for check_device.json.")
 flags.DEFINE_float("tolerance", 1e-4, "Largest relative difference.", 0.0)
 flags.DEFINE_list("fields", [], "Which fields to check; all of them if left out.")
 
-SCHEMA_VERSION = 1
-
 
 def main() -> None:
     folder = runtime.given_folder("workdir", "a folder for the results")
-    unknown = sorted({*FLAGS.fields} - {*FIELDS})
-    if unknown:
-        raise ConfigError(f"--fields: unknown {unknown}; known: {', '.join(FIELDS)}")
+    known = [*same_numbers.FIELDS]
+    if unknown := sorted({*FLAGS.fields} - {*known}):
+        raise ConfigError(f"--fields: unknown {unknown}; known: {', '.join(known)}")
     device = jax.devices()[0]
     if device.platform == "cpu":
         raise ConfigError(
             "JAX_PLATFORMS: JAX sees no device but the CPU, so there is nothing to compare; "
             "install JAX for the accelerator"
         )
-    folder.mkdir(parents=True, exist_ok=True)
-    path, found = folder / DEVICE_FILE, {}
-    for name in FLAGS.fields or FIELDS:
-        found[name] = check_field(name, device, jax.devices("cpu")[0])
+    path, found, wrong = folder / same_numbers.DEVICE_FILE, {}, []
+    for name in FLAGS.fields or known:
+        found[name] = same_numbers.check_field(name, device, jax.devices("cpu")[0])
+        wrong = same_numbers.too_large(found, FLAGS.tolerance)
         result = {
-            "schema_version": SCHEMA_VERSION,
-            "device": device_name(),
+            "schema_version": 1,
+            "device": runtime.device_name(),
             "matmul_precision": str(jax.config.jax_default_matmul_precision or "default"),
             "tolerance": FLAGS.tolerance,
             "differences": found,
-            "above_tolerance": too_large(found, FLAGS.tolerance),
+            "above_tolerance": wrong,
             "command": runtime.command_line(),
-            "versions": versions(),
+            "versions": runtime.versions(),
         }
         write_json(path, result)
-    print(f"numbers: {path}")
-    print(FORMATS["markdown"](differences_table(found)))
-    if result["above_tolerance"]:
-        wrong = "; ".join(result["above_tolerance"])
-        sys.exit(f"error: {result['device']} differs from the CPU in {wrong}")
+    print(f"numbers: {path}\n{markdown(same_numbers.differences_table(found))}")
+    if wrong:
+        sys.exit(f"error: {runtime.device_name()} differs from the CPU in {'; '.join(wrong)}")
 
 
 if __name__ == "__main__":

@@ -14,46 +14,27 @@ import numpy as np
 from absl import flags
 from matplotlib.figure import Figure
 
+from bavs_jax.fields.deformation import cell_sides
+from bavs_jax.uncertainty.draws import colour_deviation
+from experiments import runtime
 from experiments.evaluate import evenly_spaced
 from experiments.posthoc import script
-from experiments.posthoc.draws import (
-    ViewDraws,
-    draw_views,
-    farthest_view,
-    largest_offset,
-    spread_measures,
-)
+from experiments.posthoc.draws import draw_views, farthest_view, spread_measures
 from experiments.reporting.pictures import Panel, panel_table
 from experiments.reporting.plots import save_figure
-from experiments.reporting.result_tables import SPLITS
 from experiments.trained import TrainedRun
 
 NUM_SHOWN = 3  # draws in the picture
 
 FLAGS = flags.FLAGS
 flags.adopt_module_key_flags(script)
-flags.DEFINE_integer("num_draws", 16, "Offsets drawn from the posterior.")
-flags.DEFINE_integer("num_views", 8, "Training views, and as many test views, that are rendered.")
-flags.DEFINE_float(
-    "scale", 0.0, "Temperature of the draws; 0: what the training views' error says of the noise."
-)
-flags.DEFINE_float(
-    "limit",
-    1.0,
-    "Largest offset, in cells of the deformation grid. The posterior is that of small offsets: a "
-    "vertex in empty space has no curvature, but far offsets would bring matter there.",
-)
-
-
-def draw_all() -> None:
-    """Draws, renders, measures and writes, run by run."""
-    script.check_flags(
-        ("num_draws", 2 <= FLAGS.num_draws <= 1024, "give a number from 2 to 1024"),
-        ("num_views", FLAGS.num_views >= 1, "give 1 or more"),
-        ("scale", 0.0 <= FLAGS.scale <= 1e9, "give a number above 0, or 0 for the noise's own"),
-        ("limit", 0.0 < FLAGS.limit <= 1e6, "give a number above 0, up to 1e6"),
-    )
-    script.measure_runs(draw_run, "draws.json")
+flags.DEFINE_integer("num_draws", 16, "Offsets drawn from the posterior.", 2, 1024)
+flags.DEFINE_integer("num_views", 8, "Rendered training views, and as many test views.", 1)
+SCALE = "Temperature of the draws; 0: what the training views' error says of the noise."
+flags.DEFINE_float("scale", 0.0, SCALE, 0.0, 1e9)
+# The posterior is that of small offsets: a vertex in empty space has no curvature, but far offsets
+# would bring matter there.
+flags.DEFINE_float("limit", 1.0, "Largest offset, in cells of the grid.", 1e-6, 1e6)
 
 
 def draw_run(run: TrainedRun) -> dict:
@@ -66,51 +47,43 @@ def draw_run(run: TrainedRun) -> dict:
         run,
         np.concatenate([seen, held_out]),
         num_draws=FLAGS.num_draws,
-        scale=FLAGS.scale or None,
-        limit=largest_offset(run.setup.grid, FLAGS.limit),
+        scale=FLAGS.scale,
+        limit=FLAGS.limit * cell_sides(run.problem.grid),
     )
     split = {"training": views[: len(seen)], "test": views[len(seen) :]}
-    split["farthest"] = [view for view in split["test"] if view.view_id == far]
-    shown = [split["training"][0], *split["farthest"]]
+    split["farthest"] = [view for view in split["test"] if view["view_id"] == far]
     path = run.folder / "draws" / "draws.png"
-    save_figure(draws_figure(run, shown), path)
-    print(f"picture:  {path}")
-    measures = {name: spread_measures(part) for name, part in split.items()}
-    for name, words in SPLITS.items():
-        print(f"{words}: {_in_words(measures[name])}")
+    save_figure(draws_figure(run, split["training"][0], *split["farthest"]), path)
+    print(f"picture: {path}")
     return {
         "options": {"num_draws": FLAGS.num_draws, "scale": scale, "limit": FLAGS.limit},
         "farthest_test_view": far,
-        **measures,
+        **{name: spread_measures(part) for name, part in split.items()},
     }
 
 
-def draws_figure(run: TrainedRun, views: list[ViewDraws]) -> Figure:
+def draws_figure(run: TrainedRun, training_view: dict, far_view: dict) -> Figure:
     """A training view and the test view farthest from all of them, under some draws."""
-    spread_top = max(float(np.percentile(view.spread, 99.5)) for view in views) or 1.0
-    uncertainty = np.concatenate([view.uncertainty.ravel() for view in views])
-    limits = (0.0, float(uncertainty.max()) or 1.0)
+    shown = {"training view": training_view, "far test view": far_view}
+    spreads = [np.asarray(colour_deviation(view["draws"])) for view in shown.values()]
+    spread_top = max(float(np.percentile(spread, 99.5)) for spread in spreads) or 1.0
+    top = max(float(view["uncertainty"].max()) for view in shown.values()) or 1.0
     rows = []
-    for name, view in zip(("training view", "far test view"), views):
+    for (name, view), spread in zip(shown.items(), spreads):
         panels = [
-            Panel("truth", run.truth(view.view_id)),
-            Panel("render", view.rgb),
-            *(Panel(f"draw {i + 1}", image) for i, image in enumerate(view.draws[:NUM_SHOWN])),
-            Panel("rendered uncertainty", view.uncertainty, "cividis", limits),
-            Panel("spread over draws", view.spread, "magma", (0.0, spread_top)),
+            Panel("truth", run.photo(view["view_id"])[0]),
+            Panel("render", view["rgb"]),
+            *(Panel(f"draw {i + 1}", image) for i, image in enumerate(view["draws"][:NUM_SHOWN])),
+            Panel("rendered uncertainty", view["uncertainty"], "cividis", (0.0, top)),
+            Panel("spread over draws", spread, "magma", (0.0, spread_top)),
         ]
         rows.append((name, panels))
     return panel_table(rows, scale_label="spread over draws (colours in [0, 1])")
 
 
-def _in_words(measures: dict) -> str:
-    if measures["spread"] is None:
-        return "no pixel meets matter"
-    words = f"colours move by {measures['spread']:.4f} (standard deviation)"
-    if measures["rank_correlation"] is None:
-        return words
-    return f"{words}, rank correlation with uncertainty {measures['rank_correlation']:.2f}"
+def main() -> None:
+    script.measure_runs(draw_run, "draws.json")
 
 
 if __name__ == "__main__":
-    script.run_on_trained(draw_all)
+    runtime.run_script(main)

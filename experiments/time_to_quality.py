@@ -14,34 +14,35 @@ scene's photos are made before.
 from __future__ import annotations
 
 import json
+import math
 import pathlib
 import shutil
 import subprocess
 import sys
 import time
 
+import jax
 from absl import flags
 from ml_collections import config_flags
 
+from bavs_jax.active import round_keys
+from bavs_jax.training.fit import fit
 from experiments import runtime
-from experiments.bench.quality import first_seconds, measure_run, parse_targets, plateau
-from experiments.bench.results import QUALITY, quality_tables, write_quality_page
+from experiments.bench import results
+from experiments.bench.stages import SEED, Subject
 from experiments.build_scene import load_config_scene
 from experiments.configs import base
-from experiments.errors import ConfigError
+from experiments.errors import ConfigError, shown
+from experiments.evaluate import evaluate_views, evenly_spaced
 from experiments.files import write_json
+from experiments.keys import run_key
+from experiments.progress import track
 from experiments.reporting.tables import collected_text
-from experiments.runtime import versions
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS
-config_flags.DEFINE_config_file(
-    "config",
-    base.__file__,
-    "The scene, the field and how it is trained; every option is explained in "
-    "experiments/configs/base.py and can be set as --config.name=value.",
-    lock_config=True,
-)
+CONFIG = "Scene, field and training; see experiments/configs/base.py; set as --config.name=value."
+config_flags.DEFINE_config_file("config", base.__file__, CONFIG, lock_config=True)
 flags.DEFINE_string("workdir", None, "Folder for time_to_quality.json and its page.")
 flags.DEFINE_integer("num_views", 20, "Training views.", 1)
 flags.DEFINE_integer("num_test_views", 25, "Test views, evenly spaced; 0: all.", 0)
@@ -51,73 +52,99 @@ PREPARE, CACHES = "prepare", ("cold", "warm")
 flags.DEFINE_enum("part", None, (PREPARE, *CACHES), "Set by the script itself: a part of its work.")
 flags.DEFINE_float("started", None, "Set by the script itself: when that part was started.")
 
-SCHEMA_VERSION = 1
 
-
-def start_process(folder: pathlib.Path, part: str) -> dict | None:
-    """One part in a process of its own; what it wrote, if anything.
+def compare_caches(config, folder: pathlib.Path) -> None:
+    """Both runs, one after another, and the files.
 
     This process never touches the device, which a second one might not be able to share. Ctrl-C
     reaches this one only, which ends the other.
     """
-    command = [sys.executable, "-m", "experiments.time_to_quality", *sys.argv[1:]]
-    path = folder / f"{part}.json"
-    path.unlink(missing_ok=True)
-    command += [f"--part={part}", f"--started={time.time()!r}"]
-    done = subprocess.run(command, check=False, start_new_session=True)
-    if done.returncode:
-        sys.exit(done.returncode)
-    if not path.exists():
-        return None
-    found = json.loads(path.read_text(encoding="utf-8"))
-    path.unlink()
-    return found
-
-
-def run_part(config, folder: pathlib.Path, part: str, targets: list[str]) -> None:
-    """What a process that `start_process` has started does."""
-    if part == PREPARE:
-        load_config_scene(config, cache_dir=runtime.scene_cache())
-        return
-    print(f"{part} compilation cache:", flush=True)
-    runtime.use_compilation_cache(folder / "compiled")
-    found = measure_run(
-        config,
-        num_views=FLAGS.num_views,
-        num_test_views=FLAGS.num_test_views,
-        every=FLAGS.every,
-        started=FLAGS.started,
-    )
-    seconds = first_seconds(found["curve"], targets)
-    ending = plateau(found["curve"])
-    write_json(folder / f"{part}.json", {"seconds_to_db": seconds, "plateau": ending, **found})
-
-
-def compare_caches(config, folder: pathlib.Path, command: str) -> None:
-    """Both runs, one after another, and the files."""
     folder.mkdir(parents=True, exist_ok=True)
     shutil.rmtree(folder / "compiled", ignore_errors=True)
-    start_process(folder, PREPARE)
-    runs = {cache: start_process(folder, cache) for cache in CACHES}
-    common = {name: runs["cold"][name] for name in ("device", "scene", "num_test_views")}
+    about, runs = {}, {}
+    for part in (PREPARE, *CACHES):
+        command = [sys.executable, "-m", "experiments.time_to_quality", *sys.argv[1:]]
+        command += [f"--part={part}", f"--started={time.time()!r}"]
+        done = subprocess.run(command, check=False, start_new_session=True)
+        if done.returncode:
+            sys.exit(done.returncode)
+        if part != PREPARE:
+            path = folder / f"{part}.json"
+            about, runs[part] = json.loads(path.read_text(encoding="utf-8"))
+            path.unlink()
     result = {
-        "schema_version": SCHEMA_VERSION,
-        **common,
-        "runs": {
-            cache: {name: run[name] for name in ("seconds_to_db", "plateau", "curve")}
-            for cache, run in runs.items()
-        },
+        "schema_version": 1,
+        **about,
+        "runs": runs,
         "num_views": FLAGS.num_views,
         "config": config.to_dict(),
-        "command": command,
-        "versions": versions(),
+        "command": runtime.command_line(),
+        "versions": runtime.versions(),
     }
-    write_json(folder / QUALITY, result)
-    page = folder / "time_to_quality.html"
-    write_quality_page(page, result)
-    print(collected_text(quality_tables(folder / QUALITY)))
-    print(f"numbers: {folder / QUALITY}")
-    print(f"page:    {page}")
+    path = folder / results.QUALITY
+    write_json(path, result)
+    found = results.quality_tables(path)
+    page = results.write_result_page(path, found, "Time to quality")
+    print(f"{collected_text(found)}\nnumbers: {path}\npage:    {page}")
+
+
+def run_part(config, folder: pathlib.Path, targets: list[str]) -> None:
+    """What a process that `compare_caches` has started does.
+
+    It trains as a run does, to the end of its round, and looks at test views on the way.
+    """
+    if FLAGS.part != PREPARE:
+        print(f"{FLAGS.part} compilation cache:", flush=True)
+        runtime.use_compilation_cache(folder / "compiled")
+    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
+    if FLAGS.part == PREPARE:
+        return
+    subject = Subject(config, scene, FLAGS.num_views)
+    trainer, steps = subject.problem.trainer, config.train.steps_per_call
+    view_ids = evenly_spaced(scene.test, FLAGS.num_test_views)
+    *_, train_key = round_keys(run_key(SEED), 0)
+    start = (subject.state, subject.problem.table, subject.is_training)
+    started, curve = FLAGS.started, []
+    with track(trainer.num_calls * steps, f"train on {FLAGS.num_views} views", "steps") as bar:
+        for fitted in fit(train_key, trainer, *start, label="train"):
+            bar.advance(steps)
+            if fitted.calls % -(-FLAGS.every // steps) and fitted.calls != trainer.num_calls:
+                continue
+            jax.block_until_ready(fitted.train)
+            stopped = time.time()
+            psnr = evaluate_views(
+                subject.problem.render(fitted.train),
+                scene,
+                view_ids,
+                rays_per_pixel=config.rays_per_pixel,
+            )["psnr"]
+            seconds = stopped - started
+            curve.append({"step": fitted.calls * steps, "seconds": seconds, "psnr": psnr})
+            started += time.time() - stopped
+            bar.advance(0, psnr=psnr)
+    about = {"device": runtime.device_name(), "scene": scene.name, "num_test_views": len(view_ids)}
+    found = {
+        "seconds_to_db": results.first_seconds(curve, targets),
+        "plateau": results.plateau(curve),
+        "curve": curve,
+    }
+    write_json(folder / f"{FLAGS.part}.json", [about, found])
+
+
+def given_targets() -> list[str]:
+    """PSNRs in dB as they were given, the smallest first.
+
+    Raises:
+      ConfigError: there is none, or one of them is not a finite number.
+    """
+    try:
+        numbers = [*map(float, FLAGS.targets)]
+    except ValueError:
+        numbers = []
+    if not numbers or not all(map(math.isfinite, numbers)):
+        given = shown(FLAGS.targets)
+        raise ConfigError(f"--targets: {given} are not all numbers; give some like 25,28")
+    return sorted(FLAGS.targets, key=float)
 
 
 def main() -> None:
@@ -125,11 +152,11 @@ def main() -> None:
     if (FLAGS.part is None) != (FLAGS.started is None):
         raise ConfigError("--part and --started: are set by the script itself; leave them out")
     config.lpips_net = ""
-    targets = parse_targets(FLAGS.targets)
+    targets = given_targets()
     if FLAGS.part is None:
-        compare_caches(config, folder, runtime.command_line())
+        compare_caches(config, folder)
     else:
-        run_part(config, folder, FLAGS.part, targets)
+        run_part(config, folder, targets)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import pathlib
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -12,25 +14,29 @@ from ml_collections import ConfigDict
 
 from bavs_jax.active import ActiveState
 from bavs_jax.pixel_table import num_training_pixels
+from bavs_jax.rendering.images import render_views
 from bavs_jax.selection.policies import POLICIES, get_policy
-from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired, SceneSetup
+from bavs_jax.uncertainty.model import Acquired
 from bavs_jax.uncertainty.models.laplace import laplace_variance, training_curvature
-from bavs_jax.uncertainty.posterior import posterior_precision
-from experiments.build import Problem
+from bavs_jax.uncertainty.points import make_point_fn
+from experiments import progress
+from experiments.build import RENDER_CHUNK, Problem
 from experiments.build_trainer import KINDS
 from experiments.configs import base
 from experiments.errors import WorkdirError
 from experiments.keys import stream_key
 from experiments.runner import Run
 from experiments.schema import check_config
+from experiments.workdir import Part
 
-FIRST_ROUND = "initial"  # folder of round 0, which all policies of a seed share
+# Folders of round 0, which all policies of a seed with the same kind of field share.
+FIRST_ROUNDS = {Part(None, kind, 0).name.partition("/")[0]: kind for kind in KINDS}
+FIRST_ROUND = "initial"
 
 
 class TrainedRun(NamedTuple):
     """The last checkpoint of one run of `experiments.active_selection`."""
 
-    config: ConfigDict
     problem: Problem
     state: ActiveState
     num_rays: int  # R of Eq 13: the training rays of round 0
@@ -44,10 +50,6 @@ class TrainedRun(NamedTuple):
         return f"{self.policy} seed {self.seed}"
 
     @property
-    def setup(self) -> SceneSetup:
-        return self.problem.setup
-
-    @property
     def acquired(self) -> Acquired:
         state = self.state
         known = (state.train, state.table, state.is_training_view, self.num_rays)
@@ -58,26 +60,46 @@ class TrainedRun(NamedTuple):
         """Rows of the pixel table."""
         return np.flatnonzero(np.asarray(self.state.is_training_view))
 
-    def truth(self, view_id: int) -> np.ndarray:
-        """True colours of a view of the pixel table, [H, W, 3] in [0, 1]."""
-        return self._of_view(self.state.table.pixels, view_id) / 255.0
-
-    def pixel_mask(self, view_id: int) -> np.ndarray:
-        """Which pixels of a view count, [H, W] bool."""
-        mask = self.state.table.pixel_mask
-        if len(mask) == 1:  # no view has a mask
-            width, height = self.state.table.cameras.sizes[view_id]
-            return np.ones((int(height), int(width)), bool)
-        return self._of_view(mask, view_id)
-
-    def _of_view(self, values, view_id: int) -> np.ndarray:
+    def photo(self, view_id: int) -> tuple[np.ndarray, np.ndarray]:
+        """True colours of a view of the table, [H, W, 3] in [0, 1], and which count, [H, W]."""
         table = self.state.table
-        start, stop = (int(n) for n in table.offsets[view_id : view_id + 2])
-        width, height = (int(n) for n in table.cameras.sizes[view_id])
-        return np.asarray(values[start:stop]).reshape(height, width, *values.shape[1:])
+        width, height = np.asarray(table.cameras.sizes)[view_id]
+        rows = slice(*np.asarray(table.offsets)[view_id : view_id + 2])
+        # A table without masks has a single True for all pixels.
+        mask = np.broadcast_to(table.pixel_mask, len(table.pixels))[rows]
+        rgb = np.asarray(table.pixels[rows]) / 255.0
+        return rgb.reshape(height, width, 3), mask.reshape(height, width)
+
+    def render(self, chunk_fn: Callable, view_ids, progress_fn=None) -> list[dict]:
+        """Images of views of the pixel table; see `render_views`."""
+        options = {"rays_per_pixel": self.problem.config.rays_per_pixel, "chunk": RENDER_CHUNK}
+        cameras = self.state.table.cameras
+        return render_views(chunk_fn, cameras, view_ids, progress_fn=progress_fn, **options)
+
+    def track(self, view_ids, label: str, times: int = 1):
+        """Progress over all rays of some views."""
+        pixels = int(np.diff(np.asarray(self.state.table.offsets))[view_ids].sum())
+        num_rays = times * self.problem.config.rays_per_pixel * pixels
+        return progress.track(num_rays, f"{self.label}: {label}", "rays")
+
+    def curvature(self) -> jax.Array:
+        """`jac_sq_sum` [G, 3] of the training rays, with progress."""
+        # The key of the run's own pictures, so that the same uncertainty comes out.
+        key, setup = stream_key(self.seed, "pictures"), self.problem.setup
+        return training_curvature(key, setup, self.acquired, setup.laplace.weighting)
+
+    def variance(self) -> jax.Array:
+        """The vertex variance [G] that the run's uncertainty channel interpolates."""
+        return laplace_variance(self.curvature(), self.num_rays, self.problem.laplace)
+
+    def point_fn(self) -> Callable:
+        """`positions [K, 3] -> dict`: density, sigma and colour there; see `make_point_fn`."""
+        setup = self.problem.setup
+        point_fn = make_point_fn(setup.model, setup.grid, variant=setup.laplace.variant)
+        return partial(point_fn, self.state.train.model, self.variance())
 
 
-# --- which run ---
+# --- which run -------------------------------------------------------------------------------
 
 
 def saved_config(workdir: pathlib.Path) -> ConfigDict:
@@ -87,13 +109,12 @@ def saved_config(workdir: pathlib.Path) -> ConfigDict:
       WorkdirError: there is none, or one that this version cannot read.
     """
     path = workdir / "config.json"
-    config = base.get_config()
-    config.lock()
+    config = base.get_config().lock()
     try:
         saved = json.loads(path.read_text(encoding="utf-8"))
         if "field" in saved:  # the group's name before
             saved["hash_grid"] = saved.pop("field")
-        config.update(_with_tuples(saved))
+        config.update(saved)
     except FileNotFoundError as error:
         raise WorkdirError(
             f"{path}: does not exist: give the --workdir of a run, or a --config to start one"
@@ -106,12 +127,15 @@ def saved_config(workdir: pathlib.Path) -> ConfigDict:
 
 def find_runs(workdir: pathlib.Path) -> list[tuple[str, int]]:
     """(policy, seed) of the runs that have a checkpoint, first rounds among them."""
-    known = []
-    for folder in workdir.glob("*/seed_*/checkpoints"):
-        name, seed = folder.parent.parent.name, folder.parent.name.removeprefix("seed_")
-        has_any = any(path.name.isdigit() for path in folder.iterdir())
-        if has_any and seed.isdigit() and (name in POLICIES or _first_round_kind(name)):
-            known.append((name, int(seed)))
+    known = set()
+    for path in workdir.glob("*/seed_*/checkpoints/*"):
+        policy, seed = path.parts[-4], path.parts[-3].removeprefix("seed_")
+        if (
+            path.name.isdigit()
+            and seed.isdigit()
+            and (policy in POLICIES or policy in FIRST_ROUNDS)
+        ):
+            known.add((policy, int(seed)))
     return sorted(known)
 
 
@@ -141,35 +165,28 @@ def choose_runs(workdir: pathlib.Path, config, policy: str, seed: int | None) ->
 
 def field_kind(policy: str) -> str:
     """Kind of field that a policy's runs, or a folder of first rounds, train."""
-    return _first_round_kind(policy) or get_policy(policy).field_kind
+    return FIRST_ROUNDS.get(policy) or get_policy(policy).field_kind
 
 
-# --- its field ---
+# --- its field -------------------------------------------------------------------------------
 
 
-def load_run(config, problem: Problem, workdir: pathlib.Path, policy: str, seed: int) -> TrainedRun:
+def load_run(problem: Problem, workdir: pathlib.Path, policy: str, seed: int) -> TrainedRun:
     """Takes up a run, finished or not, where its last checkpoint is.
 
     Args:
-      config: of the folder.
-      problem: built from it, for fields of `field_kind(policy)`.
+      problem: built from the folder's config, for fields of `field_kind(policy)`.
       workdir: as given to `experiments.active_selection`.
       policy, seed: one of `find_runs`.
     """
-    run = Run(config, problem, workdir, None if _first_round_kind(policy) else policy, seed)
+    own = None if policy in FIRST_ROUNDS else policy
+    run = Run(problem.config, problem, workdir, own, seed)
     state = run.state()
     run.checkpoints.close()
-    last_round = config.num_rounds if run.policy else 0
-    return TrainedRun(
-        config=config,
-        problem=problem,
-        state=state,
-        num_rays=int(num_training_pixels(problem.scene, run.initial).sum()),
-        folder=run.folder,
-        policy=policy,
-        seed=seed,
-        completed=int(state.round) == last_round and int(state.calls) >= problem.trainer.num_calls,
-    )
+    num_rays = int(num_training_pixels(problem.scene, run.initial).sum())
+    is_last = int(state.round) == (problem.config.num_rounds if own else 0)
+    completed = is_last and int(state.calls) >= problem.trainer.num_calls
+    return TrainedRun(problem, state, num_rays, run.folder, policy, seed, completed)
 
 
 def train_run(
@@ -184,48 +201,6 @@ def train_run(
     """
     first = Run(config, problem, workdir, None, seed, command)
     first.finish()
-    if not _first_round_kind(policy):
+    if policy not in FIRST_ROUNDS:
         Run(config, problem, workdir, policy, seed, command).finish(first)
-    return load_run(config, problem, workdir, policy, seed)
-
-
-# --- its posterior ---
-
-
-def run_curvature(run: TrainedRun) -> jax.Array:
-    """`jac_sq_sum` [G, 3] of the training rays, with progress."""
-    # The key of the run's own pictures, so that the same uncertainty comes out.
-    key = stream_key(run.seed, "pictures")
-    setup = run.setup
-    return training_curvature(key, setup, run.acquired, setup.laplace.weighting)
-
-
-def run_variance(run: TrainedRun, jac_sq_sum: jax.Array) -> jax.Array:
-    """The vertex variance [G] that the run's uncertainty channel interpolates."""
-    return laplace_variance(jac_sq_sum, run.num_rays, run.setup.laplace)
-
-
-def run_precision(run: TrainedRun, jac_sq_sum: jax.Array) -> jax.Array:
-    """H of the run's posterior, [G, 3] (Eq 13)."""
-    options = run.setup.laplace
-    return posterior_precision(
-        jac_sq_sum,
-        num_rays=run.num_rays,
-        prior_weight=options.prior_weight,
-        weighting=options.weighting,
-    )
-
-
-def _first_round_kind(name: str) -> str | None:
-    """Kind of field that a folder of first rounds holds; None for any other folder."""
-    if name == FIRST_ROUND:
-        return RECONSTRUCTION
-    kind = name.removeprefix(f"{FIRST_ROUND}_")
-    return kind if kind != name and kind in KINDS else None
-
-
-def _with_tuples(values):
-    """JSON's lists as the tuples that they were."""
-    if isinstance(values, dict):
-        return {name: _with_tuples(value) for name, value in values.items()}
-    return tuple(map(_with_tuples, values)) if isinstance(values, list) else values
+    return load_run(problem, workdir, policy, seed)

@@ -30,9 +30,9 @@ WORK = {
     "experiments.remeasure": ("remeasure",),
     "experiments.benchmark": ("benchmark",),
     "experiments.time_to_quality": ("compare_caches", "run_part"),
-    "experiments.export_field": ("script.trained_runs",),
-    "experiments.clean_up": ("script.trained_runs",),
-    "experiments.posterior_draws": ("script.trained_runs",),
+    "experiments.export_field": ("script.saved_config", "script.load_config_scene"),
+    "experiments.clean_up": ("script.saved_config", "script.load_config_scene"),
+    "experiments.posterior_draws": ("script.saved_config", "script.load_config_scene"),
     "experiments.report": ("write_report",),
 }
 
@@ -77,12 +77,7 @@ def start_script(module) -> None:
     """What Python does with a script's exit, without leaving the fork by another way."""
     code = 1
     try:
-        if hasattr(module, "main"):
-            module.runtime.run_script(module.main)
-        else:
-            entry = {"export_field": "export", "clean_up": "clean_up"}
-            work = entry.get(module.__name__.rpartition(".")[2], "draw_all")
-            module.script.run_on_trained(getattr(module, work))
+        module.runtime.run_script(module.main)
         code = 0
     except SystemExit as error:
         if isinstance(error.code, int):

@@ -10,7 +10,7 @@ import pytest
 
 from bavs_jax.cameras import Rays
 from bavs_jax.fields.base import Field
-from bavs_jax.fields.deformation import DeformationGrid
+from bavs_jax.fields.deformation import DeformationGrid, cell_sides
 from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 from bavs_jax.uncertainty.draws import (
     colour_deviation,
@@ -19,7 +19,7 @@ from bavs_jax.uncertainty.draws import (
     noise_scale,
 )
 from bavs_jax.uncertainty.posterior import default_prior_weight, posterior_precision
-from experiments.posthoc.draws import ViewDraws, farthest_view, largest_offset, spread_measures
+from experiments.posthoc.draws import farthest_view, spread_measures
 from tests.toy_fields import (
     NOTHING_LEARNT,
     even_sampler,
@@ -138,20 +138,18 @@ def test_measures_are_over_covered_pixels():
     """Two pixels with matter, of which the more uncertain one moves more, and an empty one."""
     draws = np.zeros((2, 1, 3, 3))
     draws[1, 0, 0], draws[1, 0, 1] = 0.1, 0.3
-    view = ViewDraws(
-        0,
-        rgb=np.zeros((1, 3, 3)),
-        opacity=np.array([[1.0, 0.9, 0.0]]),
-        uncertainty=np.array([[0.3, 0.6, 0.9]]),
-        draws=draws,
-    )
+    view = {
+        "opacity": np.array([[1.0, 0.9, 0.0]]),
+        "uncertainty": np.array([[0.3, 0.6, 0.9]]),
+        "draws": draws,
+    }
     measures = spread_measures([view, view])
     assert measures["num_views"] == 2 and measures["num_covered_pixels"] == 4
     # Of two values 0 and x the unbiased standard deviation is x / sqrt(2).
     np.testing.assert_allclose(measures["spread"], 0.2 / np.sqrt(2), rtol=1e-5)
     np.testing.assert_allclose(measures["spread_all"], 0.4 / 3 / np.sqrt(2), rtol=1e-5)
     np.testing.assert_allclose(measures["rank_correlation"], 1.0)
-    nothing = spread_measures([view._replace(opacity=np.zeros((1, 3)))])
+    nothing = spread_measures([view | {"opacity": np.zeros((1, 3))}])
     assert nothing["spread"] is None and nothing["rank_correlation"] is None
 
 
@@ -221,11 +219,12 @@ def test_what_was_photographed_stays_and_the_far_side_moves(spread_of_side):
     assert np.quantile(unseen, 0.1) > np.median(seen)
 
 
-def test_farthest_view_and_largest_offset():
+def test_farthest_view_and_sides_of_a_cell():
     scene = toy_scene()  # 12 views on a ring
-    state = SimpleNamespace(table=SimpleNamespace(cameras=scene.cameras))
-    run = SimpleNamespace(state=state, training_views=np.arange(4))
+    table = SimpleNamespace(cameras=scene.cameras)
+    state = SimpleNamespace(table=table, is_training_view=np.arange(scene.num_views) < 4)
+    run = SimpleNamespace(state=state)
     assert farthest_view(run, np.arange(4, 12)) in (7, 8)  # opposite to the views 0 .. 3
     # Four cells along a side of 2; in contracted space the box is the middle half of the grid.
-    np.testing.assert_allclose(largest_offset(GRID, 0.5), 0.25)
-    np.testing.assert_allclose(largest_offset(GRID.replace(contracted=True), 0.5), 0.5)
+    np.testing.assert_allclose(0.5 * cell_sides(GRID), 0.25)
+    np.testing.assert_allclose(0.5 * cell_sides(GRID.replace(contracted=True)), 0.5)

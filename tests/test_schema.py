@@ -13,7 +13,7 @@ import pytest
 from ml_collections import ConfigDict
 
 from experiments import configs
-from experiments.bench.subject import check_sizes, default_sizes
+from experiments.bench.stages import check_sizes, default_sizes
 from experiments.build_scene import check_views
 from experiments.configs import base, quickstart
 from experiments.configs.paper import protocols

@@ -9,9 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from experiments.bench.quality import first_seconds, parse_targets, plateau
-from experiments.bench.results import QUALITY, quality_tables
-from experiments.errors import ConfigError
+from experiments.bench.results import QUALITY, first_seconds, plateau, quality_tables
 from experiments.reporting.tables import collected_text
 from tests.toy_runs import toy_flags
 
@@ -69,7 +67,7 @@ def test_script_measures_with_a_cold_and_a_warm_cache(tmp_path):
     assert (tmp_path / "time_to_quality.html").read_text().count("<svg") == 1
 
 
-def test_targets_are_sorted_as_numbers_and_others_refused():
-    assert parse_targets(["28", "9.5", "25"]) == ["9.5", "25", "28"]
-    with pytest.raises(ConfigError, match="--targets"):
-        parse_targets(["25", "high"])
+def test_targets_that_are_no_numbers_are_refused(tmp_path):
+    command = [sys.executable, "-m", "experiments.time_to_quality", f"--workdir={tmp_path}"]
+    done = subprocess.run([*command, "--targets=25,high"], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 1 and done.stderr.startswith("error: --targets: ")

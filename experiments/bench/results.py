@@ -5,9 +5,9 @@ from __future__ import annotations
 import pathlib
 
 import numpy as np
-from matplotlib.axes import Axes
+from markupsafe import Markup
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
+from matplotlib.ticker import EngFormatter, NullFormatter, NullLocator
 
 from experiments.reporting import plots
 from experiments.reporting.page import Section, write_page
@@ -22,15 +22,13 @@ STAGES = {
     "score": "scoring candidates",
     "select": "selecting a batch",
 }
+NEAR = 0.3  # dB below the plateau, from where on a field counts as done
 PANELS = 3  # of the plot of growth, side by side
 
 
-def amount(value: float) -> str:
-    """A number with three digits and a unit prefix: `1.23 G`."""
-    for factor, prefix in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if abs(value) >= factor:
-            return f"{value / factor:.3g} {prefix}"
-    return f"{value:.3g} "
+def amount(value: float, unit: str) -> str:
+    """A number with three digits and a unit prefix: `1.23 GB`."""
+    return EngFormatter(unit)(float(f"{value:.3g}"))
 
 
 def duration(value: float) -> str:
@@ -38,51 +36,68 @@ def duration(value: float) -> str:
     return f"{1e3 * value:.3g} ms" if value < 0.9995 else seconds(value)
 
 
-# --- tables ----------------------------------------------------------------------------------
+# --- the benchmark ---------------------------------------------------------------------------
 
 
 def stage_table(result: dict) -> Table:
     """Rates and compile times; of older files, operations and bytes too, which they counted."""
-    head = ["stage", "a second", "one run", "compiling"]
+    head = ("stage", "a second", "one run", "compiling")
     counted = all("flops_per_run" in row for row in result["stages"].values())
     if counted:
-        head += ["operations a second", "of the matrix product", "bytes a second", "of the copy"]
+        head += ("operations a second", "of the matrix product", "bytes a second", "of the copy")
     rows = []
     for name, title in STAGES.items():
         row = result["stages"][name]
         unit = row["unit"]
         run = f"{row[f'{unit}_per_run']:,.0f} in {duration(row['median_run_s'])}"
-        rate, compiling = f"{row[f'{unit}_per_s']:,.0f} {unit}", duration(row["compile_s"])
-        cells = [Cell(text) for text in (title, rate, run, compiling)]
-        if counted and row["flops_per_run"] > 0.0:
-            cells.append(Cell(f"{amount(row['flops_per_s'])}FLOP"))
-            cells.append(Cell(f"{row['share_of_matmul_ceiling']:.1%}"))
-        elif counted:
-            cells += [dash("operations were not counted on this device")] * 2
+        texts = (title, f"{row[f'{unit}_per_s']:,.0f} {unit}", run, duration(row["compile_s"]))
+        cells = [*map(Cell, texts)]
         if counted:
-            cells.append(Cell(f"{amount(row['bytes_per_s'])}B"))
+            flops, share = amount(row["flops_per_s"], "FLOP"), row["share_of_matmul_ceiling"]
+            known = row["flops_per_run"] > 0.0
+            unknown = [dash("operations were not counted on this device")] * 2
+            cells += [Cell(flops), Cell(f"{share:.1%}")] if known else unknown
+            cells.append(Cell(amount(row["bytes_per_s"], "B")))
             cells.append(Cell(f"{row['share_of_copy_ceiling']:.1%}"))
         rows.append(tuple(cells))
-    return Table(tuple(head), tuple(rows))
+    return Table(head, tuple(rows))
 
 
-def growth_table(result: dict) -> Table | None:
-    """Exponents and straight lines, or None where growth was left out."""
-    if not result["growth"]:
-        return None
-    head = ("what", "grows with", "from", "to", "time", "exponent", "off a straight line by")
+def growth_table(result: dict) -> Table:
+    """Exponents and straight lines."""
     rows = []
     for row in result["growth"].values():
-        sizes, fit = row["sizes"], row["fit"]
-        times = f"{duration(row['median_s'][0])} to {duration(row['median_s'][-1])}"
-        texts = (row["title"], row["size"], f"{sizes[0]:,}", f"{sizes[-1]:,}", times)
-        if fit is None:
-            fitted = [dash(f"{row['title']}: one size only")] * 2
-        else:
-            deviation = f"at most {fit['largest_deviation']:.0%}"
-            fitted = [Cell(f"{fit['exponent']:.2f}"), Cell(deviation)]
+        sizes, times, fit = row["sizes"], row["median_s"], row["fit"]
+        texts = [row["title"], row["size"], f"{sizes[0]:,}", f"{sizes[-1]:,}"]
+        texts.append(f"{duration(times[0])} to {duration(times[-1])}")
+        if fit is not None:
+            texts += [f"{fit['exponent']:.2f}", f"at most {fit['largest_deviation']:.0%}"]
+        fitted = [dash(f"{row['title']}: one size only")] * 2 if fit is None else []
         rows.append((*map(Cell, texts), *fitted))
+    head = ("what", "grows with", "from", "to", "time", "exponent", "off a straight line by")
     return Table(head, tuple(rows))
+
+
+def benchmark_tables(path: pathlib.Path) -> Collected:
+    """What a benchmark found; the notes say what the tables do not hold."""
+    result = read_result(path)
+    tables = {"stages": stage_table(result)}
+    if result["growth"]:
+        tables["growth"] = growth_table(result)
+    flops, copied = (result["ceilings"][x] for x in ("matmul_flops_per_s", "copy_bytes_per_s"))
+    memory = f"Peak memory: {result['peak_memory_mb']:,.0f} MB of the host"
+    if result["peak_device_memory_mb"] is not None:
+        memory += f", {result['peak_device_memory_mb']:,.0f} MB of the device"
+    notes = (
+        f"Training evaluates {result['train_samples_per_s']:,.0f} samples a second.",
+        f"Ceilings: {amount(flops, 'FLOP/s')} in a float32 matrix product, "
+        f"{amount(copied, 'B/s')} in a copy.",
+        f"{memory}.",
+    )
+    return Collected(f"`{result['command']}` ({result['device']})", tables, notes)
+
+
+# --- time to quality -------------------------------------------------------------------------
 
 
 def quality_table(result: dict) -> Table:
@@ -90,37 +105,16 @@ def quality_table(result: dict) -> Table:
     targets = list(next(iter(result["runs"].values()))["seconds_to_db"])
     rows = []
     for cache, run in result["runs"].items():
-        reached, best = run["seconds_to_db"], run["plateau"]["db"]
+        best, ending = run["plateau"]["db"], run["plateau"]["seconds"]
         why = f"not reached: {best:.2f} dB at most"
-        cells = [dash(why) if reached[t] is None else Cell(seconds(reached[t])) for t in targets]
-        ending = run["plateau"]["seconds"]
-        cells.append(dash("falls again") if ending is None else Cell(seconds(ending)))
+        reached = [(run["seconds_to_db"][target], why) for target in targets]
+        cells = [
+            dash(why) if value is None else Cell(seconds(value))
+            for value, why in (*reached, (ending, "falls again"))
+        ]
         rows.append((Cell(f"{cache} compilation cache"), *cells, Cell(f"{best:.2f}")))
     head = ("start", *(f"to {t} dB" for t in targets), "to 0.3 dB below the best", "best PSNR (dB)")
     return Table(head, tuple(rows))
-
-
-def facts(result: dict) -> list[str]:
-    """What a table does not hold, a sentence each."""
-    ceilings = result["ceilings"]
-    memory = f"Peak memory: {result['peak_memory_mb']:,.0f} MB of the host"
-    if result["peak_device_memory_mb"] is not None:
-        memory += f", {result['peak_device_memory_mb']:,.0f} MB of the device"
-    return [
-        f"Training evaluates {result['train_samples_per_s']:,.0f} samples a second.",
-        f"Ceilings: {amount(ceilings['matmul_flops_per_s'])}FLOP/s in a float32 matrix product, "
-        f"{amount(ceilings['copy_bytes_per_s'])}B/s in a copy.",
-        f"{memory}.",
-    ]
-
-
-def benchmark_tables(path: pathlib.Path) -> Collected:
-    """What a benchmark found."""
-    result = read_result(path)
-    tables = {"stages": stage_table(result)}
-    if (growth := growth_table(result)) is not None:
-        tables["growth"] = growth
-    return Collected(f"`{result['command']}` ({result['device']})", tables, tuple(facts(result)))
 
 
 def quality_tables(path: pathlib.Path) -> Collected:
@@ -130,89 +124,97 @@ def quality_tables(path: pathlib.Path) -> Collected:
     return Collected(made, {"time_to_quality": quality_table(result)})
 
 
-# --- plots -----------------------------------------------------------------------------------
+def plateau(curve: list[dict]) -> dict[str, float | None]:
+    """The best PSNR of a curve, and seconds until it comes within `NEAR` dB of it for good.
+
+    Returns:
+      `db`, and `seconds` of the first look from which on none is further below; None if even
+      the last one is.
+    """
+    best = max(point["psnr"] for point in curve)
+    below = [i for i, point in enumerate(curve) if point["psnr"] < best - NEAR - 1e-6]
+    near = curve[below[-1] + 1 :] if below else curve
+    return {"db": best, "seconds": near[0]["seconds"] if near else None}
 
 
-def growth_plot(growth: dict[str, dict]) -> str:
+def first_seconds(curve: list[dict], targets: list[str]) -> dict[str, float | None]:
+    """By target, seconds until it was first seen to be reached; None if it never was."""
+    return {
+        target: next((p["seconds"] for p in curve if p["psnr"] >= float(target)), None)
+        for target in targets
+    }
+
+
+# --- plots and pages -------------------------------------------------------------------------
+
+
+def growth_plot(result: dict) -> Markup:
     """Seconds against size, both on log scales, with the straight line; linear has a slope of 1."""
+    growth = result["growth"]
     num_rows = -(-len(growth) // PANELS)
-    figure = Figure(figsize=(4.0 * PANELS, 3.4 * num_rows), layout="constrained")
+    figure = Figure(figsize=(4.0 * PANELS, 3.4 * num_rows))
     panels = figure.subplots(num_rows, PANELS, squeeze=False).flat
     for row, axes in zip(growth.values(), panels):
-        _draw_growth(axes, row)
+        sizes, times, fit = np.array(row["sizes"]), np.array(row["median_s"]), row["fit"]
+        title = row["title"]
+        if fit is not None:
+            steps = np.geomspace(sizes[0], sizes[-1], 100)
+            line = fit["intercept_s"] + fit["slope_s"] * steps
+            label = f"straight line, off by at most {fit['largest_deviation']:.0%}"
+            axes.plot(steps[line > 0], line[line > 0], "--", color=plots.GREY, label=label)
+            proportional = times[-1] * steps / sizes[-1]
+            axes.plot(steps, proportional, color=plots.PALE, linewidth=1.0, label="in proportion")
+            title += f"\ntime ~ n^{fit['exponent']:.2f}"
+        axes.plot(sizes, times, "o", color=plots.BLUE, label="measured", **plots.DOT)
+        axes.set(xscale="log", yscale="log")
+        # Room above and below, so that a time which does not grow looks like one.
+        axes.set_ylim(min(times.min() / 2, times.max() / 8), times.max() * 2)
+        axes.set_xticks(sizes, [f"{size:,}" for size in sizes], rotation=30, ha="right")
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.yaxis.set_major_formatter(EngFormatter("s"))
+        axes.set_xlabel(f"n: {row['size']}")
+        axes.set_title(title)
+        plots.tidy(axes)
+        axes.legend(fontsize=8)
     for axes in panels:  # that are left
         axes.set_axis_off()
     return plots.to_svg(figure, salt="growth", label="How the time of each stage grows")
 
 
-def _draw_growth(axes: Axes, row: dict) -> None:
-    sizes, times, fit = np.array(row["sizes"]), np.array(row["median_s"]), row["fit"]
-    title = row["title"]
-    if fit is not None:
-        steps = np.geomspace(sizes[0], sizes[-1], 100)
-        line = fit["intercept_s"] + fit["slope_s"] * steps
-        label = f"straight line, off by at most {fit['largest_deviation']:.0%}"
-        axes.plot(steps[line > 0], line[line > 0], "--", color=plots.GREY, label=label)
-        proportional = times[-1] * steps / sizes[-1]
-        axes.plot(steps, proportional, color=plots.PALE, linewidth=1.0, label="in proportion")
-        title += f"\ntime ~ n^{fit['exponent']:.2f}"
-    axes.plot(sizes, times, "o", color=plots.BLUE, markeredgecolor="white", label="measured")
-    axes.set(xscale="log", yscale="log")
-    # Room above and below, so that a time which does not grow looks like one.
-    axes.set_ylim(min(times.min() / 2, times.max() / 8), times.max() * 2)
-    axes.set_xticks(sizes, [f"{size:,}" for size in sizes], rotation=30, ha="right")
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{1e3 * value:g} ms"))
-    axes.set_xlabel(f"n: {row['size']}", fontsize=9.5)
-    axes.set_title(title, fontsize=10, loc="left")
-    plots.tidy(axes)
-    axes.legend(frameon=False, fontsize=8)
-
-
-def quality_plot(result: dict) -> str:
+def quality_plot(result: dict) -> Markup:
     """PSNR on test views against seconds since the process was started."""
     runs = result["runs"]
-    style = plots.policy_style(list(runs))
-    figure = Figure(figsize=(6.2, 4.2), layout="constrained")
+    figure = Figure(figsize=(6.2, 4.2))
     axes = figure.add_subplot()
     for target in next(iter(runs.values()))["seconds_to_db"]:
         axes.axhline(float(target), color=plots.PALE, linewidth=1.0)
-    for cache, run in runs.items():
+    for (cache, run), colour in zip(runs.items(), (plots.BLUE, plots.VERMILION)):
         times, psnrs = zip(*((point["seconds"], point["psnr"]) for point in run["curve"]))
-        colour, marker = style[cache]
-        axes.plot(times, psnrs, color=colour, marker=marker, label=f"{cache} compilation cache")
+        axes.plot(times, psnrs, "o-", color=colour, label=f"{cache} compilation cache")
     axes.set_xlim(0.0, None)
-    axes.set_xlabel("seconds since the start, without measuring", fontsize=10)
-    axes.set_title("PSNR on test views (dB)", fontsize=10.5, loc="left")
+    axes.set_xlabel("seconds since the start, without measuring")
+    axes.set_title("PSNR on test views (dB)")
     plots.tidy(axes)
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend()
     return plots.to_svg(figure, salt="quality", label="PSNR against seconds")
 
 
-# --- pages -----------------------------------------------------------------------------------
+STOOD = "From the start of the process; the clock stands while test views are measured."
+SECTIONS = {  # of a page: the title of a table, what is said below it, and its plot
+    "stages": ("Each stage", "Rates are medians over uniformly drawn training pixels.", None),
+    "growth": ("Growth", "Medians of warm runs; an exponent of 1 is linear growth.", growth_plot),
+    "time_to_quality": ("Seconds to quality", STOOD, quality_plot),
+}
 
 
-def write_benchmark_page(path: pathlib.Path, result: dict) -> None:
-    """Rates, and growth where it was measured."""
-    note = " ".join(facts(result)) + " Rates are medians over uniformly drawn training pixels."
-    sections = [Section("Each stage", stage_table(result), note)]
-    if (table := growth_table(result)) is not None:
-        note = "Medians of warm runs. An exponent of 1 is linear growth; below 1, a fixed cost "
-        note += "still shows, which the straight line allows for."
-        sections.append(Section("Growth", table, note, [growth_plot(result["growth"])]))
-    title = f"How fast bavs_jax is: {result['scene']}, {result['num_views']} views"
-    write_page(path, title=title, made=result, sections=sections)
-
-
-def write_quality_page(path: pathlib.Path, result: dict) -> None:
-    """Time to quality."""
-    note = (
-        f"From the start of the process, with all imports and compilation, on "
-        f"{result['num_views']} training views; PSNR is the mean over "
-        f"{result['num_test_views']} test views, measured while the clock stands. The last "
-        "time is that of the first look from which on none is 0.3 dB below the best."
-    )
-    section = Section("Seconds to quality", quality_table(result), note, [quality_plot(result)])
-    title = f"Time to quality: {result['scene']}, {result['num_views']} views"
-    write_page(path, title=title, made=result, sections=[section])
+def write_result_page(path: pathlib.Path, found: Collected, title: str) -> pathlib.Path:
+    """A page beside a result file; its tables are `found`."""
+    result, sections = read_result(path), []
+    for name, table in found.tables.items():
+        heading, note, plot = SECTIONS[name]
+        sections.append(Section(heading, table, note, [plot(result)] if plot else []))
+    sections[0] = sections[0]._replace(note=" ".join([sections[0].note, *found.notes]))
+    page, what = path.with_suffix(".html"), f"{result['scene']}, {result['num_views']} views"
+    write_page(page, title=f"{title}: {what}", made=result, sections=sections)
+    return page

@@ -9,17 +9,11 @@ import numpy as np
 import optax
 
 from bavs_jax import active
-from bavs_jax.active import round_keys
-from bavs_jax.cameras import take
-from bavs_jax.pixel_table import training_pixels, view_mask
-from bavs_jax.rendering.images import render_views
 from bavs_jax.scenes import Scene
-from bavs_jax.uncertainty.channel import mean_uncertainty
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE
-from bavs_jax.uncertainty.streaming import table_rays
 from experiments import runtime
-from experiments.build import RENDER_CHUNK, build_problem
-from experiments.build_scene import initial_views, load_config_scene
+from experiments.bench.stages import SEED, Subject
+from experiments.build_scene import load_config_scene
 from experiments.configs import base
 from experiments.keys import run_key, stream_key
 from experiments.reporting.tables import Cell, Table, dash
@@ -37,26 +31,14 @@ FIELDS = {
     "flow": ({}, False, FLOW),
 }
 SMALL = {
-    "image_size": 16,
-    "lpips_net": "",
-    "train.num_rays": 128,
-    "train.capacity": 4096,
-    "hash_grid.num_levels": 4,
-    "march.num_steps": 48,
-    "march.num_slots": 16,
-    "march.occupancy_resolution": 16,
-    "nerf_mlp.depth": 2,
-    "nerf_mlp.skip": 1,
-    "mip_mlp.depth": 2,
-    "mip_mlp.skip": 1,
+    **{"image_size": 16, "lpips_net": "", "num_initial": 6, "batch_size": 4},
+    **{"train.num_rays": 128, "train.capacity": 4096, "train.num_steps": 96},
+    **{"hash_grid.num_levels": 4, "uncertainty.log2_cells": 4, "flow_training.num_draws": 4},
+    **{"march.num_steps": 48, "march.num_slots": 16, "march.occupancy_resolution": 16},
+    **{"nerf_mlp.depth": 2, "nerf_mlp.skip": 1, "mip_mlp.depth": 2, "mip_mlp.skip": 1},
     "train.steps_per_call": 1,
-    "train.num_steps": 1,
-    "num_initial": 6,
-    "batch_size": 4,
-    "uncertainty.log2_cells": 4,
-    "flow_training.num_draws": 4,
 }
-NUM_STEPS, SEED = 96, 0
+NUM_RAYS, NUM_CANDIDATES, WIDTH = 1024, 16, 8  # that are rendered and scored
 POLICIES = ("bavs", "bavs_spread")
 
 
@@ -75,44 +57,25 @@ def numbers_on(
       the state, and by name arrays to compare; those named `views, ...` hold whole numbers.
     """
     with jax.default_device(device):
-        problem = build_problem(config, scene, kind)
-        table, train_call = problem.table, problem.trainer.call
-        initial = initial_views(scene, SEED, config.num_initial)
-        is_training = view_mask(table, initial)
-        init_key, key = stream_key(SEED, "init"), run_key(SEED)
+        subject = Subject(config, scene, config.num_initial, kind)
+        problem, table = subject.problem, subject.problem.table
         if trained is None:
-            state = problem.trainer.init(init_key)
-            for number in range(NUM_STEPS):
-                state, _ = train_call(jax.random.fold_in(key, number), state, table, is_training)
-            trained = jax.tree.map(np.asarray, state)
-        state = jax.device_put(trained, device)
-
-        view_ids, pixel_ids = training_pixels(table, is_training)
-        setup = problem.setup
-        weighting = setup.laplace.weighting
-        jac_sq_sum = setup.curvature(
-            state.model,
-            label=None,
-            weighting=weighting,
-            **table_rays(table, view_ids, pixel_ids, weighting),
-        )
-        image = render_views(
-            problem.render(state), scene.cameras, scene.test[:1], chunk=RENDER_CHUNK
-        )[0]
-        found = {"colours": image["rgb"], "depths": image["depth"], "curvature": jac_sq_sum}
-        found["scores"] = mean_uncertainty(
-            problem.render(state, jac_sq_sum, len(view_ids)),
-            take(scene.cameras, np.setdiff1d(scene.pool, initial)),
-            chunk=RENDER_CHUNK,
-        )
-        whole = active.init(state, table, initial)
+            subject.train()
+            trained = jax.tree.map(np.asarray, subject.state)
+        subject.state = state = jax.device_put(trained, device)
+        subject.jac_sq_sum, subject.num_rays = subject.curvature(NUM_RAYS)(), NUM_RAYS
+        images, scores = subject.rendering(NUM_RAYS)(), subject.scoring(NUM_CANDIDATES, WIDTH)()
+        found = {"colours": images["rgb"], "depths": images["depth"], "scores": scores}
+        found["curvature"] = subject.jac_sq_sum
+        key, init_key = run_key(SEED), stream_key(SEED, "init")
+        whole = active.init(state, table, subject.initial)
         for name in policies:
-            acquisition = problem.acquisition(name, initial, "check")
-            choice = active.select(round_keys(key, 1)[0], whole, acquisition)
+            acquisition = problem.acquisition(name, subject.initial, "check")
+            choice = active.select(active.round_keys(key, 1)[0], whole, acquisition)
             found[f"views, {name}"] = choice.candidates.view_ids[choice.selected]
         # Adam's first mean is a share of the gradient. Last, since the state is given away.
         state = state.replace(opt_state=problem.trainer.init(init_key).opt_state)
-        state, info = train_call(jax.random.fold_in(key, NUM_STEPS), state, table, is_training)
+        state, info = problem.trainer.call(key, state, table, subject.is_training)
         moments = jax.tree.leaves(optax.tree_utils.tree_get(state.opt_state, "mu"))
         found["loss"] = info.loss
         found["gradient"] = np.concatenate([np.ravel(moment) for moment in moments])
@@ -155,9 +118,7 @@ def differences_table(differences: dict[str, dict[str, float]]) -> Table:
     names = list(dict.fromkeys(what for row in differences.values() for what in row))
     rows = []
     for name, row in differences.items():
-        cells = [
-            Cell(f"{row[what]:.1e}") if what in row else dash(f"not compared for {name}")
-            for what in names
-        ]
+        missing = dash(f"not compared for {name}")
+        cells = [Cell(f"{row[what]:.1e}") if what in row else missing for what in names]
         rows.append((Cell(name), *cells))
     return Table(("field", *names), tuple(rows))

@@ -2,297 +2,303 @@
 
 from __future__ import annotations
 
-import dataclasses
+import copy
+import itertools
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from ml_collections import ConfigDict
 
-from bavs_jax.cameras import Cameras
+from bavs_jax.cameras import Cameras, reduced_cameras, take, view_pixels
+from bavs_jax.candidates import scene_hemisphere
+from bavs_jax.pixel_table import training_pixels, view_mask
 from bavs_jax.rendering.images import render_pixels
+from bavs_jax.scenes import Scene
 from bavs_jax.selection.batch import acquire
 from bavs_jax.selection.context import make_context
 from bavs_jax.selection.policies import get_policy
-from bavs_jax.training.fit import Trainer
-from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.channel import mean_uncertainty
+from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired
 from bavs_jax.uncertainty.streaming import table_rays
-from experiments.bench.subject import (
-    SEED,
-    Subject,
-    changed,
-    draw_candidates,
-    draw_training_pixels,
-    make_subject,
-    pixel_centres,
-)
 from experiments.build import RENDER_CHUNK, build_problem
+from experiments.build_scene import initial_views
+from experiments.build_trainer import train_aside
 from experiments.keys import run_key, stream_key
 from experiments.progress import track
 from experiments.runtime import peak_device_memory_mb, peak_memory_mb
+from experiments.schema import MAX_LOG2_CELLS, MAX_WIDTH, check_options, leaves, several, whole
 
-# --- the clock -------------------------------------------------------------------------------
+SEED = 0
 
-
-def timed(fn: Callable[[], Any]) -> tuple[float, Any]:
-    """Seconds of one call until all that it returns is there, and what that is."""
-    start = time.perf_counter()
-    value = jax.block_until_ready(fn())
-    return time.perf_counter() - start, value
+# --- how much is measured --------------------------------------------------------------------
 
 
-def timed_runs(fn: Callable[[], Any], repeats: int) -> tuple[list[float], list[Any]]:
-    """The same of several calls, one after another."""
-    seconds, values = zip(*(timed(fn) for _ in range(repeats)))
-    return list(seconds), list(values)
+def default_sizes() -> ConfigDict:
+    """Sizes for a few minutes on two cores; tests and big machines take others."""
+    sizes = ConfigDict()
+    sizes.repeats = 5  # runs of each stage, of which the median counts
+    sizes.train_calls = 4  # compiled training calls of one run
+    sizes.render_rays = 65536
+    sizes.curvature_rays = 32768
+    sizes.candidates = 100  # that are scored
+    sizes.candidate_pixels = 50  # image width of a candidate
+    sizes.select_candidates = 1000  # that a batch is selected from
+    sizes.batch_size = 16
+    sizes.matmul = 4096  # side of the square matrices of the ceiling
+    sizes.copy_mb = 256  # 10^6 bytes of the array of the other ceiling
+    sizes.growth = ConfigDict()
+    sizes.growth.repeats = 3
+    sizes.growth.train_calls = 2
+    sizes.growth.train_rays = (512, 1024, 2048, 4096)  # of one step
+    sizes.growth.render_rays = (4096, 16384, 65536, 131072)
+    sizes.growth.curvature_rays = (4096, 16384, 32768, 65536)
+    sizes.growth.grid_log2 = (5, 6, 7, 8)  # L: grids of 2^L cells per side
+    sizes.growth.grid_rays = 16384  # whose curvature each grid gets
+    sizes.growth.candidates = (25, 100, 250, 1000)
+    sizes.growth.candidate_pixels = 25
+    sizes.growth.batch_size = (1, 4, 16, 64)
+    return sizes
 
 
-def measure_ceilings(*, matmul: int, copy_mb: int, repeats: int) -> dict[str, float]:
-    """What the plainest programs reach; the best of several runs.
-
-    Args:
-      matmul: n, of `[n, n] @ [n, n]` in float32 at JAX's default precision, `2 n^3` operations.
-      copy_mb: 10^6 bytes of an array that is read once and written once. One is added on the way,
-        which costs nothing beside the traffic: XLA would hand over the same array for a plain copy.
-      repeats: runs of each.
-
-    Returns:
-      `matmul_flops_per_s` and `copy_bytes_per_s`, read and written.
-    """
-    square = jnp.ones((matmul, matmul), jnp.float32)
-    array = jnp.ones(copy_mb * 10**6 // 4, jnp.float32)
-    product, copy = jax.jit(jnp.matmul), jax.jit(lambda x: x + 1.0)
-    best = []
-    for run in (lambda: product(square, square), lambda: copy(array)):
-        timed(run)
-        best.append(min(timed_runs(run, repeats)[0]))
-    return {
-        "matmul_flops_per_s": 2.0 * matmul**3 / best[0],
-        "copy_bytes_per_s": 2.0 * array.nbytes / best[1],
-    }
+def check_sizes(sizes: ConfigDict) -> None:
+    """Raises ConfigError for a size that cannot be used."""
+    limits = {"candidate_pixels": MAX_WIDTH, "grid_log2": MAX_LOG2_CELLS, "matmul": 1 << 16}
+    limits |= {"copy_mb": 1 << 16, "repeats": 1000, "train_calls": 1000}
+    schema = {}
+    for name, value in leaves(default_sizes()).items():
+        one = whole(1, limits.get(name.rpartition(".")[2], 1 << 24))
+        schema[name] = several(one, 1, 16) if isinstance(value, tuple) else one
+    check_options(sizes, schema, "sizes")
 
 
 # --- one run of each stage -------------------------------------------------------------------
 
 
-def make_training_run(
-    subject: Subject, trainer: Trainer, trained: TrainState, calls: int
-) -> Callable[[], tuple[float, float]]:
-    """Makes `run() -> (rays that fitted the buffer, samples)`, which trains on from a copy."""
-    # A training call is given its state for good, and others still need this one.
-    state, number = jax.tree.map(lambda x: x.copy(), trained), 0
-    steps, key = subject.config.train.steps_per_call, jax.random.fold_in(run_key(SEED), 1)
-    table, is_training = subject.problem.table, subject.is_training_view
+class Subject:
+    """What is measured: a scene, a field, and what a run of `active_selection` does with them.
 
-    def run():
-        nonlocal state, number
-        infos = []
-        for _ in range(calls):
-            state, info = trainer.call(jax.random.fold_in(key, number), state, table, is_training)
-            infos.append(info)
-            number += 1
-        jax.block_until_ready(state)
-        means = np.array([[float(info.rays), float(info.samples)] for info in infos])
-        return tuple(steps * means.sum(axis=0))
-
-    return run
-
-
-def make_rendering_run(subject: Subject, state: TrainState, num_rays: int) -> Callable:
-    """Makes `run() -> images`, colour and depth, of so many training pixels."""
-    cameras = subject.problem.table.cameras
-    view_ids, pixel_ids = draw_training_pixels(subject, num_rays)
-    pixels, chunk_fn = pixel_centres(cameras, view_ids, pixel_ids), subject.problem.render(state)
-    return lambda: render_pixels(chunk_fn, cameras, view_ids, pixels, chunk=RENDER_CHUNK)
-
-
-def make_curvature_run(subject: Subject, state: TrainState, num_rays: int) -> Callable:
-    """Makes `run() -> jac_sq_sum` of so many training pixels."""
-    setup, table = subject.problem.setup, subject.problem.table
-    pixels, weighting = draw_training_pixels(subject, num_rays), setup.laplace.weighting
-    return lambda: setup.curvature(
-        state.model, label=None, weighting=weighting, **table_rays(table, *pixels, weighting)
-    )
-
-
-def make_scoring_run(
-    subject: Subject, state: TrainState, jac_sq_sum, num_rays: int, cameras: Cameras
-) -> Callable:
-    """Makes `run() -> scores` of candidates (Eq 15); `num_rays` are those of the curvature.
-
-    Every candidate is scored: no distance filter has gone before.
+    `training`, `rendering`, `curvature`, `scoring` and `selection` make a function that does one
+    piece of such work and returns the result; it compiles when it is first called.
     """
-    chunk_fn = subject.problem.render(state, jac_sq_sum, num_rays)
-    return lambda: mean_uncertainty(chunk_fn, cameras, chunk=RENDER_CHUNK)
+
+    def __init__(self, config, scene: Scene, num_views: int, kind: str = RECONSTRUCTION):
+        self.config, self.scene = config, scene
+        self.problem = build_problem(config, scene, kind)
+        self.initial = initial_views(scene, SEED, num_views)
+        self.is_training = view_mask(self.problem.table, self.initial)
+        self.state = self.problem.trainer.init(stream_key(SEED, "init"))
+        self.jac_sq_sum, self.num_rays = None, 0  # of `curvature`, for `scoring`
+
+    def train(self) -> None:
+        """Trains the field as one round does."""
+        problem, key = self.problem, run_key(SEED)
+        acquired = Acquired(None, problem.table, self.is_training, 0, label=self.scene.name)
+        self.state = train_aside(self.config, problem.trainer, key, acquired, problem.kind, track)
+
+    def changed(self, **options) -> Subject:
+        """The same field under other options; `__` in a name stands for a dot."""
+        other = copy.copy(self)
+        other.config = self.config.copy_and_resolve_references()
+        values = {name.replace("__", "."): value for name, value in options.items()}
+        other.config.update_from_flattened_dict(values)
+        other.problem = build_problem(other.config, self.scene, self.problem.kind)
+        return other
+
+    def draw_cameras(self, num: int, width: int) -> Cameras:
+        """Cameras on the hemisphere (Eq 14) with images `width` pixels wide, as photos are."""
+        first = take(self.scene.cameras, np.full(num, self.scene.pool[0]))
+        poses = scene_hemisphere(stream_key(SEED, "places"), self.scene, num)
+        scale = width / float(first.sizes[0, 0])
+        return reduced_cameras(first.replace(world_from_cam=poses), scale)
+
+    def training(self, num_calls: int) -> Callable[[], np.ndarray]:
+        """Trains on from a copy; the result is (rays that fitted the buffer, samples)."""
+        # A training call is given its state for good, and others still need this one.
+        state, numbers = jax.tree.map(jnp.copy, self.state), itertools.count()
+        steps, key = self.config.train.steps_per_call, jax.random.fold_in(run_key(SEED), 1)
+        call, views = self.problem.trainer.call, (self.problem.table, self.is_training)
+
+        def run():
+            nonlocal state
+            infos = []
+            for number in itertools.islice(numbers, num_calls):
+                state, info = call(jax.random.fold_in(key, number), state, *views)
+                infos.append(info)
+            jax.block_until_ready(state)
+            return steps * np.sum([[float(i.rays), float(i.samples)] for i in infos], axis=0)
+
+        return run
+
+    def rendering(self, num_rays: int) -> Callable[[], Any]:
+        """Renders training pixels, drawn uniformly: colour and depth."""
+        cameras, chunk_fn = self.problem.table.cameras, self.problem.render(self.state)
+        view_ids, pixels = view_pixels(cameras, np.flatnonzero(self.is_training))
+        rows = np.random.default_rng(SEED).integers(0, len(view_ids), num_rays)
+        pixels, view_ids = pixels[rows], view_ids[rows]
+        return lambda: render_pixels(chunk_fn, cameras, view_ids, pixels, chunk=RENDER_CHUNK)
+
+    def curvature(self, num_rays: int) -> Callable[[], jax.Array]:
+        """The summed squared Jacobian of training pixels, drawn uniformly (Eq 13)."""
+        setup, table = self.problem.setup, self.problem.table
+        view_ids, pixel_ids = training_pixels(table, self.is_training)
+        rows = np.random.default_rng(SEED).integers(0, len(view_ids), num_rays)
+        weighting = setup.laplace.weighting
+        rays = table_rays(table, view_ids[rows], pixel_ids[rows], weighting)
+        return lambda: setup.curvature(self.state.model, label=None, weighting=weighting, **rays)
+
+    def scoring(self, num_candidates: int, width: int) -> Callable[[], Any]:
+        """Scores candidates (Eq 15): every one, as no distance filter has gone before."""
+        cameras = self.draw_cameras(num_candidates, width)
+        chunk_fn = self.problem.render(self.state, self.jac_sq_sum, self.num_rays)
+        return lambda: mean_uncertainty(chunk_fn, cameras, chunk=RENDER_CHUNK)
+
+    def selection(self, num_candidates: int, batch_size: int) -> Callable[[], tuple]:
+        """`bavs` with scores that cost nothing: the max-min distance filter (Fig 5), and top-k."""
+        scores = np.random.default_rng(SEED).uniform(size=num_candidates).astype(np.float32)
+        ctx = make_context(
+            self.draw_cameras(num_candidates, 1).positions,
+            training_positions=self.problem.table.cameras.positions,
+            is_training_view=self.is_training,
+            centre=self.scene.centre,
+            mean_uncertainty_fn=lambda indices, picked: scores[indices],
+        )
+        policy, key = get_policy("bavs"), run_key(SEED)
+        return lambda: acquire(policy, key, ctx, batch_size)
 
 
-def make_selection_run(subject: Subject, num_candidates: int, batch_size: int) -> Callable:
-    """Makes `run() -> (selected, SelectionInfo)` of `bavs`, with scores that cost nothing.
-
-    What is timed is the max-min distance filter (Fig 5), the largest scores of those at hand, and
-    the report.
-    """
-    cameras = draw_candidates(subject, num_candidates, 1)
-    scores = np.random.default_rng(SEED).uniform(size=num_candidates).astype(np.float32)
-    ctx = make_context(
-        cameras.positions,
-        training_positions=subject.problem.table.cameras.positions,
-        is_training_view=subject.is_training_view,
-        centre=subject.scene.centre,
-        mean_uncertainty_fn=lambda indices, picked: scores[indices],
-    )
-    policy, key = get_policy("bavs"), run_key(SEED)
-    return lambda: acquire(policy, key, ctx, batch_size)
+# --- the clock -------------------------------------------------------------------------------
 
 
-# --- stages ----------------------------------------------------------------------------------
+def timed(run: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds of one call until all that it returns is there, and what that is."""
+    start = time.perf_counter()
+    value = jax.block_until_ready(run())
+    return time.perf_counter() - start, value
 
 
-@dataclasses.dataclass(frozen=True)
-class Stage:
-    """One stage, run several times after it was compiled."""
-
-    unit: str  # what it is counted in, in the plural
-    amounts: list[float]  # of units, in each run
-    seconds: list[float]  # of each run
-    compile_seconds: float  # what the very first run took longer
-    run: Callable[[], Any]  # does it once more
-    memory_mb: float = dataclasses.field(default_factory=peak_memory_mb)
-    device_memory_mb: float | None = dataclasses.field(default_factory=peak_device_memory_mb)
-
-    @property
-    def rate(self) -> float:
-        """Median of units per second."""
-        return float(np.median(np.divide(self.amounts, self.seconds)))
-
-    def numbers(self) -> dict:
-        """All that is known of it, with units in the names."""
-        return {
-            "unit": self.unit,
-            f"{self.unit}_per_run": float(np.median(self.amounts)),
-            f"{self.unit}_per_s": self.rate,
-            "run_s": self.seconds,
-            "median_run_s": float(np.median(self.seconds)),
-            "compile_s": self.compile_seconds,
-            "peak_memory_so_far_mb": self.memory_mb,
-            "peak_device_memory_so_far_mb": self.device_memory_mb,
-        }
+def timed_runs(run: Callable[[], Any], repeats: int) -> tuple[float, list[float], list[Any]]:
+    """Seconds of a first call, which compiles; those of some more, and what these return."""
+    first, _ = timed(run)
+    seconds, values = zip(*(timed(run) for _ in range(repeats)))
+    return first, list(seconds), list(values)
 
 
-def training_compile_seconds(subject: Subject) -> float:
-    """What the first compiled call takes longer than the second."""
-    state = subject.problem.trainer.init(stream_key(SEED, "init"))
-    run = make_training_run(subject, subject.problem.trainer, state, 1)
-    first, second = timed(run)[0], timed(run)[0]
-    return first - second
-
-
-def measure_training(subject: Subject, state: TrainState, sizes, compile_seconds: float):
-    """Steady state: the field is trained, so that its sampler skips what is empty.
+def measure_stages(subject: Subject, sizes) -> tuple[dict[str, dict], float, dict[str, Callable]]:
+    """Trains the field to its end, so that its sampler skips what is empty, then times each stage.
 
     Returns:
-      the stage in rays, and the median of samples per second.
+      numbers of each stage, by name; the median of training samples per second; a run of each.
     """
-    run = make_training_run(subject, subject.problem.trainer, state, sizes.train_calls)
-    timed(run)
-    seconds, amounts = timed_runs(run, sizes.repeats)
-    rays, samples = np.transpose(amounts)
-    stage = Stage("rays", rays.tolist(), seconds, compile_seconds, run)
-    return stage, float(np.median(samples / seconds))
+    run = subject.training(1)
+    compile_s = timed(run)[0] - timed(run)[0]
+    subject.train()
+    stages, runs = {}, {}
+
+    def measure(name: str, unit: str, run: Callable, amount: float | None = None) -> list:
+        """Notes a stage; its amount of units in a run, if not given, is the first of its values."""
+        first, seconds, values = timed_runs(run, sizes.repeats)
+        amounts = np.array([value[0] for value in values] if amount is None else [amount])
+        runs[name] = run
+        stages[name] = {
+            "unit": unit,
+            f"{unit}_per_run": float(np.median(amounts)),
+            f"{unit}_per_s": float(np.median(amounts / seconds)),
+            "run_s": seconds,
+            "median_run_s": float(np.median(seconds)),
+            "compile_s": first - float(np.median(seconds)),
+            "peak_memory_so_far_mb": peak_memory_mb(),
+            "peak_device_memory_so_far_mb": peak_device_memory_mb(),
+        }
+        bar.advance(1)
+        return values
+
+    with track(5, "measure", "stages") as bar:
+        values = measure("train", "rays", subject.training(sizes.train_calls))
+        stages["train"]["compile_s"] = compile_s  # its programs had been compiled before
+        samples = np.array([num for _, num in values]) / stages["train"]["run_s"]
+        measure("render", "rays", subject.rendering(sizes.render_rays), sizes.render_rays)
+        num_rays = sizes.curvature_rays
+        values = measure("curvature", "rays", subject.curvature(num_rays), num_rays)
+        subject.jac_sq_sum, subject.num_rays = values[-1], num_rays
+        run = subject.scoring(sizes.candidates, sizes.candidate_pixels)
+        measure("score", "candidates", run, sizes.candidates)
+        run = subject.selection(sizes.select_candidates, sizes.batch_size)
+        measure("select", "batches", run, 1)
+    return stages, float(np.median(samples)), runs
 
 
-def measure_stage(unit: str, amount: float, run: Callable, repeats: int) -> Stage:
-    """A stage of which every run does the same, compiled by its first one."""
-    first, _ = timed(run)
-    seconds, _ = timed_runs(run, repeats)
-    return Stage(unit, [amount] * repeats, seconds, first - float(np.median(seconds)), run)
+def measure_ceilings(sizes) -> dict[str, float]:
+    """What the plainest programs reach; the best of several runs.
+
+    A product of square float32 matrices of side n, at JAX's default precision, is `2 n^3`
+    operations. An array is read once and written once; one is added on the way, which costs nothing
+    beside the traffic: XLA would hand over the same array for a plain copy.
+    """
+    square = jnp.ones((sizes.matmul, sizes.matmul), jnp.float32)
+    array = jnp.ones(sizes.copy_mb * 10**6 // 4, jnp.float32)
+    product, copied = jax.jit(jnp.matmul), jax.jit(lambda x: x + 1.0)
+    runs = (lambda: product(square, square), lambda: copied(array))
+    product_s, copy_s = (min(timed_runs(run, sizes.repeats)[1]) for run in runs)
+    return {
+        "matmul_flops_per_s": 2.0 * sizes.matmul**3 / product_s,
+        "copy_bytes_per_s": 2.0 * array.nbytes / copy_s,
+    }
 
 
 # --- growth ----------------------------------------------------------------------------------
 
 
-class Series(NamedTuple):
-    """One thing that grows."""
-
-    title: str  # what takes the time
-    size: str  # what grows
-    sizes: tuple[int, ...]
-    make_run: Callable[[int], Callable]  # size -> a run to be timed
-    divisor: float = 1.0  # of the seconds of a run, where it holds more than one
-
-
-def all_series(
-    subject: Subject, state: TrainState, jac_sq_sum, num_rays: int, sizes
-) -> dict[str, Series]:
-    """What is measured; `num_rays` are those of `jac_sq_sum`."""
-    growth = sizes.growth
-    num_steps = growth.train_calls * subject.config.train.steps_per_call
-
-    def training(rays):
-        capacity = rays * subject.config.train.capacity // subject.config.train.num_rays
-        config = changed(subject.config, train__num_rays=rays, train__capacity=capacity)
-        trainer = build_problem(config, subject.scene).trainer
-        return make_training_run(subject, trainer, state, growth.train_calls)
-
-    def curvature_on(cells):
-        config = changed(subject.config, uncertainty__log2_cells=int(np.log2(cells)))
-        other = make_subject(config, subject.scene, int(subject.is_training_view.sum()))
-        return make_curvature_run(other, state, growth.grid_rays)
-
-    def scoring(num):
-        cameras = draw_candidates(subject, num, growth.candidate_pixels)
-        return make_scoring_run(subject, state, jac_sq_sum, num_rays, cameras)
-
-    def rendering(rays):
-        return make_rendering_run(subject, state, rays)
-
-    def curvature(rays):
-        return make_curvature_run(subject, state, rays)
-
-    def selection_among(candidates):
-        return make_selection_run(subject, candidates, batch)
-
-    def selection_of(batch_size):
-        return make_selection_run(subject, num, batch_size)
-
-    cells = tuple(2**level for level in growth.grid_log2)
+def measure_growth(subject: Subject, sizes) -> dict[str, dict]:
+    """Medians of the warm runs of each stage at several sizes, and how they grow."""
+    growth, train = sizes.growth, subject.config.train
     num, batch = sizes.select_candidates, min(sizes.batch_size, *growth.candidates)
-    views, on_grid = "views of the batch", f"Curvature of {growth.grid_rays:,} rays"
-    of_batch, among = f"Selecting a batch of {batch}", f"Selecting among {num:,} candidates"
-    return {
-        "train_rays": Series("Training step", "rays", growth.train_rays, training, num_steps),
-        "render_rays": Series("Rendering", "rays", growth.render_rays, rendering),
-        "curvature_rays": Series("Curvature", "rays", growth.curvature_rays, curvature),
-        "curvature_grid": Series(on_grid, "grid cells per side", cells, curvature_on),
-        "score_candidates": Series("Scoring", "candidates", growth.candidates, scoring),
-        "select_candidates": Series(of_batch, "candidates", growth.candidates, selection_among),
-        "select_batch": Series(among, views, growth.batch_size, selection_of),
+
+    def training(rays: int):
+        capacity = rays * train.capacity // train.num_rays
+        options = {"train__num_rays": rays, "train__capacity": capacity}
+        return subject.changed(**options).training(growth.train_calls)
+
+    def on_grid(cells: int):
+        other = subject.changed(uncertainty__log2_cells=int(np.log2(cells)))
+        return other.curvature(growth.grid_rays)
+
+    cells = [2**level for level in growth.grid_log2]
+    scoring = partial(subject.scoring, width=growth.candidate_pixels)
+    among, of_batch = partial(subject.selection, batch_size=batch), partial(subject.selection, num)
+    of_size = f"Selecting a batch of {batch}"
+    on, among_all = f"Curvature of {growth.grid_rays:,} rays", f"Selecting among {num:,} candidates"
+    # What takes the time, what grows, its sizes, and how a run of one size is made.
+    series = {
+        "train_rays": ("Training step", "rays", growth.train_rays, training),
+        "render_rays": ("Rendering", "rays", growth.render_rays, subject.rendering),
+        "curvature_rays": ("Curvature", "rays", growth.curvature_rays, subject.curvature),
+        "curvature_grid": (on, "grid cells per side", cells, on_grid),
+        "score_candidates": ("Scoring", "candidates", growth.candidates, scoring),
+        "select_candidates": (of_size, "candidates", growth.candidates, among),
+        "select_batch": (among_all, "views of the batch", growth.batch_size, of_batch),
     }
-
-
-def measure_growth(series: dict[str, Series], repeats: int) -> dict[str, dict]:
-    """Medians of the warm runs at each size, and how they grow."""
+    num_steps = {"train_rays": growth.train_calls * train.steps_per_call}  # of a run
     rows = {}
-    with track(sum(len(s.sizes) for s in series.values()), "growth", "sizes") as bar:
-        for name, one in series.items():
+    with track(sum(len(row[2]) for row in series.values()), "growth", "sizes") as bar:
+        for name, (title, size, ns, make_run) in series.items():
             medians, memory = [], []
-            for size in one.sizes:
-                run = one.make_run(size)
-                timed(run)
-                seconds, _ = timed_runs(run, repeats)
-                medians.append(float(np.median(seconds)) / one.divisor)
+            for n in ns:
+                _, seconds, _ = timed_runs(make_run(n), growth.repeats)
+                medians.append(float(np.median(seconds)) / num_steps.get(name, 1))
                 memory.append(peak_memory_mb())
                 bar.advance(1)
             rows[name] = {
-                "title": one.title,
-                "size": one.size,
-                "sizes": list(one.sizes),
+                "title": title,
+                "size": size,
+                "sizes": list(ns),
                 "median_s": medians,
                 "peak_memory_so_far_mb": memory,
-                "fit": fit_growth(one.sizes, medians) if len(one.sizes) > 1 else None,
+                "fit": fit_growth(ns, medians) if len(ns) > 1 else None,
             }
     return rows
 

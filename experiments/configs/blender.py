@@ -5,8 +5,5 @@ from experiments.configs import base
 
 def get_config():
     config = base.get_config()
-    config.loader = "blender"
-    config.scene = "lego"
-    config.image_size = 100
-    config.num_rounds = 4
+    config.update(loader="blender", scene="lego", image_size=100, num_rounds=4)
     return config

@@ -9,16 +9,9 @@ from experiments.configs import base
 
 def get_config():
     config = base.get_config()
-    config.loader = "nerfstudio"
-    config.scene = ""
-    config.image_size = 240
-    config.policies = ("bavs",)
-    config.num_initial = 50
-    config.num_rounds = 0
-    config.rays_per_pixel = 1
-    config.hash_grid.finest = 512
-    config.hash_grid.appearance_features = 4
-    config.train.num_rays = 1024  # each with all of its samples
-    config.train.num_steps = 4000
+    config.update(loader="nerfstudio", scene="", image_size=240, rays_per_pixel=1)
+    config.update(policies=("bavs",), num_initial=50, num_rounds=0)
+    config.hash_grid.update(finest=512, appearance_features=4)
+    config.train.update(num_steps=4000, num_rays=1024)  # each ray with all of its samples
     config.uncertainty.max_rays = 100_000
     return config

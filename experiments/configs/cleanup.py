@@ -5,11 +5,7 @@ from experiments.configs import blender
 
 def get_config():
     config = blender.get_config()
-    config.num_initial = 8
-    config.num_rounds = 0
-    config.policies = ("random",)
-    config.seeds = (0, 1, 2)
-    config.train.num_steps = 1000
+    config.update(num_initial=8, num_rounds=0, policies=("random",), seeds=(0, 1, 2), lpips_net="")
     config.num_test_final = 25  # of the untouched field; the clean-up measures for itself
-    config.lpips_net = ""
+    config.train.num_steps = 1000
     return config

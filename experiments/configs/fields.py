@@ -12,11 +12,6 @@ from experiments.configs import blender
 
 def get_config():
     config = blender.get_config()
-    config.policies = ("random",)
-    config.seeds = (0, 1, 2, 3, 4)
-    config.num_initial = 12
-    config.num_rounds = 0
-    config.num_test_final = 25
-    config.num_pictures = 1
-    config.lpips_net = ""
+    config.update(policies=("random",), seeds=(0, 1, 2, 3, 4), num_initial=12, num_rounds=0)
+    config.update(num_test_final=25, num_pictures=1, lpips_net="")
     return config

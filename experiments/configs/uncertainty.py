@@ -5,11 +5,7 @@ from experiments.configs import blender
 
 def get_config():
     config = blender.get_config()
-    config.num_initial = 20
-    config.num_rounds = 0
-    config.policies = ("random",)
-    config.seeds = (0, 1, 2, 3, 4)
+    config.update(num_initial=20, num_rounds=0, policies=("random",), seeds=(0, 1, 2, 3, 4))
+    config.update(lpips_net="", num_test_final=25)  # of the run; AUSE has views of its own
     config.train.num_steps = 1600
-    config.lpips_net = ""
-    config.num_test_final = 25  # of the run; AUSE and intervals have views of their own
     return config

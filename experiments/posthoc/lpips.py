@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import pathlib
 from collections.abc import Sequence
 
@@ -11,10 +10,10 @@ from experiments.build import Problem, build_problem
 from experiments.build_scene import load_config_scene
 from experiments.errors import ConfigError, WorkdirError
 from experiments.evaluate import measure_test_views
-from experiments.files import read_json, write_json
+from experiments.files import write_json
 from experiments.reporting.report import write_report
 from experiments.sweeps.plan import read_record
-from experiments.trained import TrainedRun, field_kind, find_runs, load_run, saved_config
+from experiments.trained import TrainedRun, field_kind, load_run, saved_config
 from experiments.workdir import is_completed
 
 PSNR_TOLERANCE = 0.02  # dB; another machine adds up in another order
@@ -42,71 +41,54 @@ def remeasure(
       WorkdirError, SceneError: the folder or the scene cannot be used.
     """
     record = read_record(folder)
-    rows = [{"folder": "."}] if record is None else record.settings
-    for setting in [folder / row["folder"] for row in rows]:
-        _measure_folder(setting, command, lpips_net, policies, data_dir)
+    names = ["."] if record is None else [row["folder"] for row in record.settings]
+    for setting in [folder / name for name in names]:
+        config = saved_config(setting)
+        config.lpips_net, config.data_dir = lpips_net, data_dir or config.data_dir
+        ended = [result for result in workdir.collect(setting)["runs"] if is_completed(result)]
+        known = {result["policy"] for result in ended}
+        if unknown := [policy for policy in policies if policy not in known]:
+            raise ConfigError(f"--policy: {unknown[0]}: {setting} holds no finished run of it")
+        chosen = [result for result in ended if result["policy"] in (policies or known)]
+        todo = [result for result in chosen if not _has_lpips(result, lpips_net)]
+        if not todo:
+            print(f"{setting}: nothing is left to measure")
+            continue
+        scene = load_config_scene(config, cache_dir=runtime.scene_cache())
+        problems: dict[str, Problem] = {}
+        for number, result in enumerate(todo, start=1):
+            kind = field_kind(result["policy"])
+            if kind not in problems:
+                problems[kind] = build_problem(config, scene, kind)
+            if problems[kind].lpips_fn is None:
+                raise ConfigError(f"--lpips_net: {problems[kind].lpips_reason}")
+            run = load_run(problems[kind], setting, result["policy"], result["seed"])
+            _measure_run(run, result, f"{run.label} ({number} of {len(todo)})", command)
+        workdir.collect(setting)
+        print(f"report: {write_report(setting)}")
 
 
-def _measure_folder(folder: pathlib.Path, command: str, lpips_net, policies, data_dir) -> None:
-    config = saved_config(folder)
-    config.lpips_net = lpips_net
-    config.data_dir = data_dir or config.data_dir
-    todo = _runs_without(folder, lpips_net, policies)
-    if not todo:
-        print(f"{folder}: nothing is left to measure")
-        return
-    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
-    problems: dict[str, Problem] = {}
-    for number, (policy, seed) in enumerate(todo):
-        kind = field_kind(policy)
-        if kind not in problems:
-            problems[kind] = build_problem(config, scene, kind)
-        if problems[kind].lpips_fn is None:
-            raise ConfigError(f"--lpips_net: {problems[kind].lpips_reason}")
-        run = load_run(config, problems[kind], folder, policy, seed)
-        measure_run(run, f"{policy} seed {seed} ({number + 1} of {len(todo)})", command)
-    workdir.collect(folder)
-    print(f"report: {write_report(folder)}")
+def _has_lpips(result: dict, net: str) -> bool:
+    """Whether a result holds the LPIPS of this network."""
+    own = result.get("lpips_net", result["config"]["lpips_net"])
+    return own == net and result["rounds"][-1]["lpips"] is not None
 
 
-def measure_run(run: TrainedRun, label: str, command: str) -> None:
+def _measure_run(run: TrainedRun, result: dict, label: str, command: str) -> None:
     """Measures one run's last field and rewrites its result file.
 
     Raises:
-      WorkdirError: the field does not have the PSNR that its result file says.
+      WorkdirError: the field does not have the PSNR that its result says.
     """
-    num = run.config.num_test_final
-    measures = measure_test_views(run.problem, run.state.train, num, label)
-    path = run.folder / "result.json"
-    result = json.loads(path.read_text(encoding="utf-8"))
-    before = result["rounds"][-1]["psnr"]
-    if not abs(measures["psnr"] - before) < PSNR_TOLERANCE:
+    config, path, last = run.problem.config, run.folder / "result.json", result["rounds"][-1]
+    measures = measure_test_views(run.problem, run.state.train, config.num_test_final, label)
+    if not abs(measures["psnr"] - last["psnr"]) < PSNR_TOLERANCE:
         raise WorkdirError(
-            f"{path}: psnr: the run had {before:.2f} dB, its checkpoint has "
+            f"{path}: psnr: the run had {last['psnr']:.2f} dB, its checkpoint has "
             f"{measures['psnr']:.2f} dB on the views that are there now: give the run's own scene "
             "with --data_dir"
         )
-    result["rounds"][-1] |= {"lpips": measures["lpips"]}
-    result |= {"lpips_reason": None, "lpips_net": run.config.lpips_net, "remeasured_by": command}
+    last["lpips"] = measures["lpips"]
+    result |= {"lpips_reason": None, "lpips_net": config.lpips_net, "remeasured_by": command}
     write_json(path, result)
     print(f"{label}: LPIPS {measures['lpips']:.4f}, PSNR {measures['psnr']:.2f} dB as before")
-
-
-def _runs_without(folder: pathlib.Path, lpips_net: str, policies) -> list[tuple[str, int]]:
-    """(policy, seed) of the runs that have ended and lack this network's LPIPS."""
-    results = {}
-    for policy, seed in find_runs(folder):
-        path = folder / policy / f"seed_{seed}" / "result.json"
-        result = read_json(path, otherwise="left out; start its run again, which makes it anew")
-        results |= {(policy, seed): result} if is_completed(result) else {}
-    known = {name for name, _ in results}
-    for policy in policies:
-        if policy not in known:
-            raise ConfigError(f"--policy: {policy}: {folder} holds no finished run of it")
-    found = []
-    for (policy, seed), result in results.items():
-        net = result.get("lpips_net", result["config"]["lpips_net"])
-        is_measured = net == lpips_net and result["rounds"][-1]["lpips"] is not None
-        if policy in (policies or known) and not is_measured:
-            found.append((policy, seed))
-    return found

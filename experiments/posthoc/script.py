@@ -18,7 +18,8 @@ from experiments.build import build_problem
 from experiments.build_scene import check_views, load_config_scene
 from experiments.errors import ConfigError
 from experiments.files import write_json
-from experiments.runtime import device_name, versions
+from experiments.reporting.result_tables import FILES
+from experiments.reporting.tables import collected_text
 from experiments.schema import MAX_SEED, given_config
 from experiments.trained import (
     FIRST_ROUND,
@@ -30,35 +31,18 @@ from experiments.trained import (
     train_run,
 )
 
-SCHEMA_VERSION = 1
-
 FLAGS = flags.FLAGS
 runtime.define_cache_flags()
-config_flags.DEFINE_config_file(
-    "config",
-    None,
+CONFIG = (
     "What to train first where --workdir does not hold it yet, such as "
     "experiments/configs/quickstart.py; every option can be set as --config.name=value. Without "
-    "it, the runs that --workdir holds are taken up where they are.",
-    lock_config=True,
+    "it, the runs that --workdir holds are taken up where they are."
 )
-flags.DEFINE_string(
-    "workdir", None, "Folder of a run of experiments.active_selection, or of a new one."
-)
-flags.DEFINE_string(
-    "policy", "", "Whose field; initial: round 0. By default the config's first policy."
-)
-flags.DEFINE_integer(
-    "seed", None, "Of which seed; by default all seeds of that policy.", 0, MAX_SEED
-)
+config_flags.DEFINE_config_file("config", None, CONFIG, lock_config=True)
+flags.DEFINE_string("workdir", None, "Folder of runs of active_selection, or of new ones.")
+flags.DEFINE_string("policy", "", "Whose field; initial: round 0. By default the config's first.")
+flags.DEFINE_integer("seed", None, "Of which seed; by default all of that policy.", 0, MAX_SEED)
 flags.DEFINE_string("data_dir", "", "Folder of scenes, if it has moved since the run.")
-
-
-def check_flags(*rules: tuple[str, bool, str]) -> None:
-    """Raises ConfigError for the first flag whose rule `(name, is good, fix)` does not hold."""
-    for name, good, fix in rules:
-        if not good:
-            raise ConfigError(f"--{name}: {FLAGS[name].value!r} cannot be used: {fix}")
 
 
 def trained_runs() -> Iterator[TrainedRun]:
@@ -68,6 +52,7 @@ def trained_runs() -> Iterator[TrainedRun]:
       ConfigError, WorkdirError, SceneError: flags, folder or scene cannot be used.
     """
     folder, config = runtime.given_folder("workdir", "the folder of a run"), given_config()
+    runtime.start_cache()
     is_new = config is not None
     if is_new:
         if FLAGS.data_dir:
@@ -92,7 +77,7 @@ def trained_runs() -> Iterator[TrainedRun]:
         if is_new:
             run = train_run(config, problem, folder, policy, seed, runtime.command_line())
         else:
-            run = load_run(config, problem, folder, policy, seed)
+            run = load_run(problem, folder, policy, seed)
         state = "the end of" if run.completed else "the last checkpoint of"
         print(f"{scene.name}: {state} {run.label}, {len(run.training_views)} training views")
         yield run
@@ -100,54 +85,34 @@ def trained_runs() -> Iterator[TrainedRun]:
 
 def measure_runs(measure: Callable[[TrainedRun], dict], name: str) -> None:
     """Measures the runs one after another; each is a row of the file `name` in --workdir."""
-    start, path, rows = time.monotonic(), pathlib.Path(FLAGS.workdir) / name, []
+    path, rows = pathlib.Path(FLAGS.workdir or "") / name, []
     for run in trained_runs():
-        before = time.monotonic()
+        start = time.monotonic()
         measured = measure(run)
-        rows.append({**about_run(run), "seconds": time.monotonic() - before, **measured})
+        rows.append({"seconds": time.monotonic() - start, **measured})
         # Written after each run, so that a command that is stopped leaves what it has measured.
-        write_json(path, result_file(run, rows))
-    print(f"numbers:  {path}")
-    print(f"({time.monotonic() - start:.0f} s in all)")
+        write_rows(path, run, rows)
+    print(f"numbers: {path}\n{collected_text(FILES[name](path))}")
 
 
-def about_run(run: TrainedRun) -> dict:
-    """What a result file says first: of which run it is."""
-    return {
+def write_rows(path: pathlib.Path, run: TrainedRun, rows: list[dict]) -> None:
+    """A result file: a row for each run of a folder, with all that made it; `run` is the last."""
+    about = {
         "policy": run.policy,
         "seed": run.seed,
         "completed": run.completed,
         "round": int(run.state.round),
         "num_views": len(run.training_views),
     }
-
-
-def result_file(run: TrainedRun, rows: list[dict]) -> dict:
-    """A result file over the runs of a folder, each a row, with all that made it.
-
-    Args:
-      run: any of them.
-      rows: each begins with `about_run`.
-    """
-    return {
-        "schema_version": SCHEMA_VERSION,
+    rows[-1] = {**about, **rows[-1]}
+    result = {
+        "schema_version": 1,
         "scene": run.problem.scene.name,
-        "kind": run.config.loader,
+        "kind": run.problem.config.loader,
         "command": runtime.command_line(),
-        "config": run.config.to_dict(),
-        "versions": versions(),
-        "device": device_name(),
+        "config": run.problem.config.to_dict(),
+        "versions": runtime.versions(),
+        "device": runtime.device_name(),
         "rows": rows,
     }
-
-
-def run_on_trained(work: Callable[[], None]) -> None:
-    """Starts `work()` as the main of a script; what is wrong with its flags ends in one line."""
-
-    def main() -> None:
-        given_config()
-        runtime.given_folder("workdir", "the folder of a run")
-        runtime.start_cache()
-        work()
-
-    runtime.run_script(main)
+    write_json(path, result)

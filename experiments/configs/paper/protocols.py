@@ -4,7 +4,8 @@
     --config=experiments/configs/paper/protocols.py:table_3,paper  as printed, for a GPU
 
 Comments say where the paper is silent. `table_1.py`, `table_2.py` and `figure_8.py` beside this
-file are the same by their own names: `table_1.py`, `table_1.py:paper`.
+file are the same by their own names: `table_1.py`, `table_1.py:paper`. Tables 2 to 4 and Figure 7
+want the scene's name: `--config.scene=...`.
 """
 
 from __future__ import annotations
@@ -19,27 +20,11 @@ from experiments.configs import base, blender, capture, rivals
 def blender_nerf() -> ConfigDict:
     """A NeRF-synthetic scene with the paper's own network (Eqs 1-5)."""
     config = blender.get_config()
-    config.image_size = 400
-    config.field_kind = "nerf_mlp"
-    config.nerf_mlp.depth = 8
-    config.nerf_mlp.width = 256
-    config.nerf_mlp.skip = 5
-    config.nerf_mlp.position_degree = 10
-    config.coarse_to_fine.num_coarse = 64
-    config.coarse_to_fine.num_fine = 128
-    config.rays_per_pixel = 1  # as published
-    config.train.num_rays = 4096
-    config.train.capacity = 262_144
-    config.train.learning_rate = 5e-4
-    config.train.num_steps = 50_000
+    config.update(image_size=400, field_kind="nerf_mlp", rays_per_pixel=1)  # as published
+    config.nerf_mlp.update(depth=8, width=256, skip=5, position_degree=10)
+    config.coarse_to_fine.update(num_coarse=64, num_fine=128)
+    config.train.update(num_steps=50_000, num_rays=4096, capacity=262_144, learning_rate=5e-4)
     config.uncertainty.log2_cells = 8
-    return config
-
-
-def activenerf() -> ConfigDict:
-    """ActiveNeRF on the paper's own network, with its field or ours."""
-    config = blender_nerf()
-    config.policies = ("activenerf", "activenerf_star")
     return config
 
 
@@ -48,55 +33,31 @@ def cf_nerf() -> ConfigDict:
     config = blender_nerf()
     config.policies = ("cf_nerf",)
     config.nerf_mlp.width = 512
-    config.flow.condition_features = 64
-    config.flow_training.num_draws = 32
-    config.uncertainty.flow_draws = 32
-    # 128 samples of a ray in all.
-    config.coarse_to_fine.num_coarse = 64
-    config.coarse_to_fine.num_fine = 64
+    config.coarse_to_fine.num_fine = 64  # 128 samples of a ray in all
+    _use_full_flow(config)
     return config
+
+
+def _use_full_flow(config: ConfigDict) -> None:
+    config.flow.condition_features = 64
+    config.flow_training.num_draws = config.uncertainty.flow_draws = 32
 
 
 def blender_mip() -> ConfigDict:
     """A NeRF-synthetic scene with Mip-NeRF 360 in its bounded form."""
     config = blender.get_config()
-    config.image_size = 400
-    config.field_kind = "mip_mlp"
-    config.mip_mlp.depth = 8
-    config.mip_mlp.width = 1024
-    config.mip_mlp.skip = 5
-    config.mip_mlp.position_degree = 12
-    config.mip_mlp.proposal_depth = 4
-    config.mip_mlp.proposal_width = 256
-    config.proposal.num_proposals = (64, 64)
-    config.proposal.num_samples = 32
-    config.proposal.anneal_steps = 1000
-    config.proposal.distortion_weight = 0.01
-    config.rays_per_pixel = 1  # as published
+    config.update(image_size=400, field_kind="mip_mlp", rays_per_pixel=1)  # as published
+    config.mip_mlp.update(depth=8, width=1024, skip=5, position_degree=12)
+    config.mip_mlp.update(proposal_depth=4, proposal_width=256)
+    config.proposal.update(num_proposals=(64, 64), num_samples=32)
+    config.proposal.update(anneal_steps=1000, distortion_weight=0.01)
     config.train.num_rays = 16_384  # some 20 GB of activations; 4096 fit a smaller GPU
-    config.train.capacity = 65_536
-    config.train.learning_rate = 2e-3
-    config.train.final_share = 0.01
-    config.train.warmup_steps = 512
-    config.train.max_grad_norm = 1e-3
-    config.train.adam_b2 = 0.999
-    config.train.adam_eps = 1e-6
-    config.train.num_steps = 50_000
+    config.train.update(num_steps=50_000, capacity=65_536)
+    config.train.update(learning_rate=2e-3, final_share=0.01, warmup_steps=512)
+    config.train.update(max_grad_norm=1e-3, adam_b2=0.999, adam_eps=1e-6)
     config.uncertainty.log2_cells = 8
     config.uncertainty.max_rays = 409_600  # a uniform subset: 4 views have 2.6 million
     return config
-
-
-def _use_large_grid(config: ConfigDict, num_steps: int) -> None:
-    """The hash grid of nerfacto's size, and as many rays at a time."""
-    config.image_size = 0  # as the files are
-    config.hash_grid.num_levels = 16
-    config.hash_grid.finest = 2048
-    config.hash_grid.log2_table_size = 19
-    config.train.num_steps = num_steps
-    config.train.num_rays = 4096
-    config.train.capacity = 262_144
-    config.uncertainty.log2_cells = 8
 
 
 def nerfacto() -> ConfigDict:
@@ -105,16 +66,20 @@ def nerfacto() -> ConfigDict:
     --config.load.downscale=2 takes the folder images_2.
     """
     config = capture.get_config()
-    _use_large_grid(config, num_steps=30_000)
-    config.hash_grid.direction_degree = 4
-    config.hash_grid.appearance_features = 32
-    config.proposal.num_proposals = (256, 96)
-    config.proposal.num_samples = 48
-    config.proposal.num_levels = 5
-    config.proposal.finest = (128, 256)
-    config.proposal.log2_table_size = 17
+    _use_large_grid(config)
+    config.hash_grid.update(direction_degree=4, appearance_features=32)
+    config.proposal.update(num_proposals=(256, 96), num_samples=48)
+    config.proposal.update(num_levels=5, finest=(128, 256), log2_table_size=17)
     config.uncertainty.max_rays = 0
     return config
+
+
+def _use_large_grid(config: ConfigDict) -> None:
+    """The hash grid of nerfacto's size, and as many rays at a time."""
+    config.image_size = 0  # as the files are
+    config.hash_grid.update(num_levels=16, finest=2048, log2_table_size=19)
+    config.train.update(num_steps=30_000, num_rays=4096, capacity=262_144)
+    config.uncertainty.log2_cells = 8
 
 
 # --- tables and figures, in two sizes --------------------------------------------------------
@@ -156,26 +121,23 @@ def table_1(size: str = "laptop") -> ConfigDict:
     return config
 
 
+def _small_capture(num_steps: int) -> ConfigDict:
+    config = capture.get_config()
+    config.update(image_size=120, lpips_net="")
+    config.train.num_steps = num_steps
+    return config
+
+
 def table_2(size: str = "laptop") -> ConfigDict:
     """Table 2: a capture of the nerfstudio dataset, 50 random views and one batch of 10 more.
 
     200 views make the pool, the others are test views. Origin, the field of the first 50, is round
-    0 of every run. Name the scene: --config.scene=dozer.
+    0 of every run; nerfstudio's own LPIPS is AlexNet's.
     """
-    if _is_paper(size):
-        config = nerfacto()
-        config.lpips_net = "alex"  # the paper is silent; nerfstudio's own is AlexNet's
-    else:
-        config = capture.get_config()
-        config.image_size = 120
-        config.train.num_steps = 1600
-        config.lpips_net = ""
+    config = nerfacto() if _is_paper(size) else _small_capture(1600)
     config.num_test = 0  # Origin, too, is measured on all test views
     config.load.pool_size = 200.0  # drawn at random; the paper does not say how
-    config.num_initial = 50
-    config.num_rounds = 1
-    config.batch_size = 10
-    config.seeds = (0, 1, 2)
+    config.update(num_initial=50, num_rounds=1, batch_size=10, seeds=(0, 1, 2))
     # The paper has random and bavs alone.
     config.policies = ("random", "bavs", "bavs_topk", "farthest", "bavs_spread")
     return config
@@ -184,28 +146,21 @@ def table_2(size: str = "laptop") -> ConfigDict:
 def table_3(size: str = "laptop") -> ConfigDict:
     """Table 3: AUSE of depth on a scene of the Light Field data, for evaluate_uncertainty.
 
-    Name the scene: --config.scene=torch, africa, statue or basket; CF-NeRF's own split of the last
-    is --config.load.split=basket-cfnerf. Trained on all views of the published split, 4 or 5 of
-    them, between the near and far planes of the papers and without contraction.
+    Scenes: torch, africa, statue or basket; CF-NeRF's own split of the last is
+    --config.load.split=basket-cfnerf. Trained on all views of the published split, 4 or 5 of them,
+    between the near and far planes of the papers and without contraction.
     """
     config = base.get_config()
     if _is_paper(size):
-        # Factor 2 of the published images, as the loader reads them.
-        _use_large_grid(config, num_steps=30_000)
-        config.flow.update(cf_nerf().flow)
-        config.flow_training.update(cf_nerf().flow_training)
-        config.uncertainty.flow_draws = 32
+        _use_large_grid(config)  # factor 2 of the published images, as the loader reads them
+        _use_full_flow(config)
     else:
         config.image_size = 240
         config.train.num_steps = 1600
-    config.loader = "lightfield"
-    config.scene = ""
+    config.update(loader="lightfield", scene="")
     config.load.split = config.get_oneway_ref("scene")
-    config.num_initial = 0
-    config.num_rounds = 0
-    config.policies = ("random",)
+    config.update(num_initial=0, num_rounds=0, policies=("random",), lpips_net="")
     config.seeds = (0, 1, 2, 3, 4)  # the paper is silent
-    config.lpips_net = ""
     config.evaluation.num_views = 0  # all test views
     return config
 
@@ -215,7 +170,7 @@ def table_4(size: str = "laptop") -> ConfigDict:
 
     `bavs` has the filter, `bavs_topk` has none. Time is that of scoring and selecting; candidates
     are those that the filter leaves. The paper's pool of 300 leaves few test views or none; at
-    laptop size it is Table 2's 200. Name the scene: --config.scene=dozer.
+    laptop size it is Table 2's 200.
     """
     config = table_2(size)
     if _is_paper(size):
@@ -227,7 +182,7 @@ def table_4(size: str = "laptop") -> ConfigDict:
 def figure_6(size: str = "laptop") -> ConfigDict:
     """Figure 6: PSNR against views, bavs and random, by Table 1's protocol.
 
-    The curve is on the report's first plot and, as numbers, in the `by_round` table of
+    The curve is on the report's first plot and, as numbers, in the `rounds` table of
     experiments.tables.
     """
     config = table_1(size)
@@ -238,7 +193,7 @@ def figure_6(size: str = "laptop") -> ConfigDict:
 def figure_7(size: str = "laptop") -> ConfigDict:
     """Figure 7: a Mip-NeRF 360 scene, 10 views growing by 10 every 3,000 iterations up to 30,000.
 
-    ActiveNeRF and bavs side by side on the same test views. Name the scene: --config.scene=garden.
+    ActiveNeRF and bavs side by side on the same test views.
     """
     if _is_paper(size):
         config = nerfacto()
@@ -246,30 +201,21 @@ def figure_7(size: str = "laptop") -> ConfigDict:
         config.train.num_steps = 3000
         config.num_rounds = 9  # the tenth period is the last round's training
     else:
-        config = capture.get_config()
-        config.image_size = 120
-        config.lpips_net = ""
-        config.train.num_steps = 800
+        config = _small_capture(800)
         config.num_rounds = 3
-    config.loader = "mipnerf360"
-    config.num_initial = 10
-    config.batch_size = 10
-    config.from_scratch = False
-    config.policies = ("activenerf", "bavs", "random")
-    config.num_pictures = 6
+    config.update(loader="mipnerf360", num_initial=10, batch_size=10, from_scratch=False)
+    config.update(policies=("activenerf", "bavs", "random"), num_pictures=6)
     return config
 
 
 def figure_8(size: str = "laptop") -> ConfigDict:
     """Figure 8: colour and uncertainty of test views, ours and random, by Table 2's protocol."""
     config = table_2(size)
-    config.policies = ("bavs", "random")
-    config.seeds = (0,)
-    config.num_pictures = 8
+    config.update(policies=("bavs", "random"), seeds=(0,), num_pictures=8)
     return config
 
 
-FIELDS = {f.__name__: f for f in (blender_nerf, blender_mip, activenerf, cf_nerf, nerfacto)}
+FIELDS = {f.__name__: f for f in (blender_nerf, blender_mip, cf_nerf, nerfacto)}
 PROTOCOLS = {
     f.__name__: f for f in (table_1, table_2, table_3, table_4, figure_6, figure_7, figure_8)
 }
