@@ -19,7 +19,15 @@ def user_units(scene: Scene) -> float:
 
 def user_points(scene: Scene, positions) -> np.ndarray:
     """Points of the scene [..., 3] in the user's coordinates, float64."""
-    matrix = np.asarray(scene.user_from_scene, np.float64)
+    return _moved(np.asarray(scene.user_from_scene, np.float64), positions)
+
+
+def scene_points(scene: Scene, positions) -> np.ndarray:
+    """Points in the user's coordinates [..., 3] as points of the scene, float64."""
+    return _moved(np.linalg.inv(np.asarray(scene.user_from_scene, np.float64)), positions)
+
+
+def _moved(matrix: np.ndarray, positions) -> np.ndarray:
     return np.asarray(positions, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
