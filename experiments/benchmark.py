@@ -28,12 +28,11 @@ from experiments.bench.subject import (
     make_subject,
     train_field,
 )
-from experiments.build_scene import load_config_scene
+from experiments.build import load_config_scene
 from experiments.configs import base
 from experiments.files import write_json
-from experiments.progress import track
 from experiments.reporting.tables import collected_text
-from experiments.runtime import device_name, peak_device_memory_mb, peak_memory_mb, versions
+from experiments.runtime import device_name, peak_device_memory_mb, peak_memory_mb, track, versions
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS

@@ -25,10 +25,9 @@ from experiments.bench.same_numbers import (
     differences_table,
     too_large,
 )
-from experiments.errors import ConfigError
 from experiments.files import write_json
 from experiments.reporting.tables import FORMATS
-from experiments.runtime import device_name, versions
+from experiments.runtime import ConfigError, device_name, versions
 
 FLAGS = flags.FLAGS
 flags.DEFINE_string("workdir", None, "Folder for check_device.json.")

@@ -29,12 +29,12 @@ from bavs_jax.uncertainty.cleanup import (
     make_cleaned_render_fn,
     threshold_sigma,
 )
-from experiments.build import RENDER_CHUNK
+from experiments.build_model import RENDER_CHUNK
 from experiments.evaluate import evenly_spaced
 from experiments.posthoc import script
-from experiments.progress import track
 from experiments.reporting.pictures import Panel, panel_table, psnr_words
 from experiments.reporting.plots import BLUE, GREEN, GREY, ORANGE, VERMILION, save_figure, tidy
+from experiments.runtime import track
 from experiments.trained import TrainedRun, run_curvature, run_variance
 
 NUM_PICTURES = 4

@@ -45,15 +45,14 @@ from bavs_jax.scenes import Scene
 from bavs_jax.scenes.poses import user_points, user_units
 from bavs_jax.scenes.sdf_surface import sample_surface
 from bavs_jax.uncertainty.channel import finish_uncertainty
-from experiments.build import RENDER_CHUNK
-from experiments.build_scene import true_surface
+from experiments.build import stream_key, true_surface
+from experiments.build_model import RENDER_CHUNK
 from experiments.files import write_arrays, write_atomic, write_json
-from experiments.keys import stream_key
 from experiments.posthoc import script
 from experiments.posthoc.points import scene_point_fn
-from experiments.progress import track
 from experiments.reporting.pictures import colour_bar
 from experiments.reporting.plots import save_figure
+from experiments.runtime import track
 from experiments.trained import TrainedRun, run_curvature, run_variance
 
 # Of the box's longest side: the shell that the true surface is drawn from, and how far from that

@@ -18,8 +18,9 @@ from ml_collections import config_flags
 
 from bavs_jax.scenes import LOADERS, load_scene
 from bavs_jax.scenes.pose_files import read_pose_file
-from experiments import runtime, workdir
-from experiments.build import build_problem
+from experiments import runtime
+from experiments.build import Problem
+from experiments.files import check_claim, claim
 from experiments.schema import MAX_SEED, MAX_WIDTH, check_config
 from experiments.suggest import choosing, places, results
 
@@ -90,14 +91,14 @@ def suggest_views(
 ) -> None:
     """Trains, proposes, chooses and writes."""
     begin = time.monotonic()
-    workdir.check_claim(folder, config)
+    check_claim(folder, config)
     scene = load_scene(FLAGS.loader, root=data, image_size=FLAGS.image_size)
     scene = choosing.all_for_training(scene, FLAGS.holdout)
     around = places.look_around(scene, options)
     print(f"{scene.name}: {len(scene.pool)} photos to train on, {len(scene.test)} left out")
 
-    problem = build_problem(config, scene)
-    workdir.claim(folder, config)
+    problem = Problem(config, scene)
+    claim(folder, config)
     field_folder = folder / "field" / f"seed_{options.seed}"
     train = choosing.train_field(config, problem, field_folder, options.seed)
     jac_sq_sum = choosing.photo_curvature(problem, train, field_folder, options.seed)

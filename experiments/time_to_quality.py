@@ -26,12 +26,11 @@ from ml_collections import config_flags
 from experiments import runtime
 from experiments.bench.quality import first_seconds, measure_run, parse_targets, plateau
 from experiments.bench.results import QUALITY, quality_tables, write_quality_page
-from experiments.build_scene import load_config_scene
+from experiments.build import load_config_scene
 from experiments.configs import base
-from experiments.errors import ConfigError
 from experiments.files import write_json
 from experiments.reporting.tables import collected_text
-from experiments.runtime import versions
+from experiments.runtime import ConfigError, versions
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS

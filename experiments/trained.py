@@ -16,12 +16,11 @@ from bavs_jax.selection.policies import POLICIES, get_policy
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired, SceneSetup
 from bavs_jax.uncertainty.models.laplace import laplace_variance, training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
-from experiments.build import Problem
-from experiments.build_trainer import KINDS
+from experiments.build import Problem, stream_key
+from experiments.build_model import KINDS
 from experiments.configs import base
-from experiments.errors import WorkdirError
-from experiments.keys import stream_key
 from experiments.runner import Run
+from experiments.runtime import WorkdirError
 from experiments.schema import check_config
 
 FIRST_ROUND = "initial"  # folder of round 0, which all policies of a seed share

@@ -13,7 +13,7 @@ from bavs_jax.selection.batch import SelectionInfo
 from experiments.bench.results import BENCHMARK, STAGES, amount, benchmark_tables, duration
 from experiments.bench.stages import fit_growth, make_selection_run, timed, timed_runs
 from experiments.bench.subject import make_subject
-from experiments.build_scene import load_config_scene
+from experiments.build import load_config_scene
 from experiments.reporting.tables import collected_text
 from tests.toy_runs import toy_config, toy_flags
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.errors import ReportError
 from experiments.files import write_arrays
 from experiments.reporting.pictures import views_figure, write_figures
 from experiments.reporting.results import load_pictures, load_runs
+from experiments.runtime import ReportError
 from tests.report_files import make_pictures, make_result, write_workdir
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from bavs_jax.uncertainty.bands import add_bands
 from bavs_jax.uncertainty.conformal_scale import ViewGroups
-from experiments.errors import ConfigError, WorkdirError
 from experiments.reporting.uncertainty import band_strip, scanline_plot
+from experiments.runtime import ConfigError, WorkdirError
 from experiments.uncertain.intervals import (
     ViewSample,
     band_arrays,

@@ -13,7 +13,7 @@ from bavs_jax.cameras import Cameras, image_pixels, look_at, pixel_rays, take
 from bavs_jax.scenes import load_nerfstudio
 from bavs_jax.scenes.base import Scene, photo_cameras
 from bavs_jax.scenes.poses import user_transforms
-from experiments.acquisitions import CAMERA_FIELDS, write_next_views
+from experiments.runner import CAMERA_FIELDS, write_next_views
 from experiments.suggest.results import write_transforms
 from tests.scene_files import edit_json, random_image, write_nerfstudio
 

@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 
 from experiments.configs import quickstart
-from experiments.errors import ConfigError, WorkdirError
 from experiments.files import exclusive, write_arrays, write_json
-from experiments.sweeps.axes import parse_axes, setting_name, settings
+from experiments.runtime import ConfigError, WorkdirError
 from experiments.sweeps.plan import (
     Record,
     make_settings,
     make_trials,
     merged,
+    parse_axes,
     read_record,
+    setting_name,
+    settings,
     write_record,
 )
 from tests.sweep_runs import (

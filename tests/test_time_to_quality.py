@@ -11,8 +11,8 @@ import pytest
 
 from experiments.bench.quality import first_seconds, parse_targets, plateau
 from experiments.bench.results import QUALITY, quality_tables
-from experiments.errors import ConfigError
 from experiments.reporting.tables import collected_text
+from experiments.runtime import ConfigError
 from tests.toy_runs import toy_flags
 
 ROOT = pathlib.Path(__file__).parents[1]

@@ -4,7 +4,6 @@ import copy
 
 import pytest
 
-from experiments.errors import ReportError
 from experiments.reporting.tables import Table
 from experiments.reporting.uncertainty import title
 from experiments.reporting.uncertainty_tables import (
@@ -17,6 +16,7 @@ from experiments.reporting.uncertainty_tables import (
     save_result,
     summary_table,
 )
+from experiments.runtime import ReportError
 from experiments.tables import result_tables
 
 LEVELS = [0.5, 0.9, 0.95]

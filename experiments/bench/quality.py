@@ -13,13 +13,9 @@ from bavs_jax.pixel_table import view_mask
 from bavs_jax.training.fit import fit
 from experiments import runtime
 from experiments.bench.subject import SEED
-from experiments.build import build_problem
-from experiments.build_scene import initial_views, load_config_scene
-from experiments.errors import ConfigError, shown
+from experiments.build import Problem, initial_views, load_config_scene, run_key, stream_key
 from experiments.evaluate import evaluate_views, evenly_spaced
-from experiments.keys import run_key, stream_key
-from experiments.progress import track
-from experiments.runtime import device_name
+from experiments.runtime import ConfigError, device_name, shown, track
 
 NEAR = 0.3  # dB below the plateau, from where on a field counts as done
 
@@ -54,7 +50,7 @@ def measure_run(config, *, num_views: int, num_test_views: int, every: int, star
       `num_test_views`.
     """
     scene = load_config_scene(config, cache_dir=runtime.scene_cache())
-    problem = build_problem(config, scene)
+    problem = Problem(config, scene)
     initial = initial_views(scene, SEED, num_views)
     view_ids = evenly_spaced(scene.test, num_test_views)
     steps, key = config.train.steps_per_call, run_key(SEED)

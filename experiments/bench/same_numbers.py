@@ -18,10 +18,9 @@ from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE
 from bavs_jax.uncertainty.scoring import mean_uncertainty
 from bavs_jax.uncertainty.streaming import table_rays
 from experiments import runtime
-from experiments.build import RENDER_CHUNK, build_problem
-from experiments.build_scene import initial_views, load_config_scene
+from experiments.build import Problem, initial_views, load_config_scene, run_key, stream_key
+from experiments.build_model import RENDER_CHUNK
 from experiments.configs import base
-from experiments.keys import run_key, stream_key
 from experiments.reporting.tables import Cell, Table, dash
 
 DEVICE_FILE = "check_device.json"
@@ -67,7 +66,7 @@ def numbers_on(
 
     Args:
       device: one of JAX's.
-      config, scene, kind: see `build_problem`.
+      config, scene, kind: see `Problem`.
       policies: that choose a batch.
       trained: the state in numpy's arrays; None: trained here.
 
@@ -75,7 +74,7 @@ def numbers_on(
       the state, and by name arrays to compare; those named `views, ...` hold whole numbers.
     """
     with jax.default_device(device):
-        problem = build_problem(config, scene, kind)
+        problem = Problem(config, scene, kind)
         table, train_call = problem.table, problem.trainer.call
         initial = initial_views(scene, SEED, config.num_initial)
         is_training = view_mask(table, initial)

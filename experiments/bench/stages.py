@@ -29,10 +29,9 @@ from experiments.bench.subject import (
     make_subject,
     pixel_centres,
 )
-from experiments.build import RENDER_CHUNK, build_problem
-from experiments.keys import run_key, stream_key
-from experiments.progress import track
-from experiments.runtime import peak_device_memory_mb, peak_memory_mb
+from experiments.build import Problem, run_key, stream_key
+from experiments.build_model import RENDER_CHUNK
+from experiments.runtime import peak_device_memory_mb, peak_memory_mb, track
 
 # --- the clock -------------------------------------------------------------------------------
 
@@ -234,7 +233,7 @@ def all_series(
     def training(rays):
         capacity = rays * subject.config.train.capacity // subject.config.train.num_rays
         config = changed(subject.config, train__num_rays=rays, train__capacity=capacity)
-        trainer = build_problem(config, subject.scene).trainer
+        trainer = Problem(config, subject.scene).trainer
         return make_training_run(subject, trainer, state, growth.train_calls)
 
     def curvature_on(cells):

@@ -13,11 +13,9 @@ from bavs_jax.pixel_table import training_pixels, view_mask
 from bavs_jax.scenes import Scene
 from bavs_jax.training.train import TrainState
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired
-from experiments.build import Problem, build_problem
-from experiments.build_scene import initial_views
-from experiments.build_trainer import train_aside
-from experiments.keys import run_key, stream_key
-from experiments.progress import track
+from experiments.build import Problem, initial_views, run_key, stream_key
+from experiments.build_model import train_aside
+from experiments.runtime import track
 from experiments.schema import MAX_LOG2_CELLS, MAX_WIDTH, check_options, leaves, several, whole
 
 
@@ -90,7 +88,7 @@ def make_subject(config, scene: Scene, num_views: int) -> Subject:
       scene: the scene.
       num_views: training views, drawn as those that a run begins with.
     """
-    problem = build_problem(changed(config, lpips_net=""), scene)
+    problem = Problem(changed(config, lpips_net=""), scene)
     is_training = view_mask(problem.table, initial_views(scene, SEED, num_views))
     return Subject(config, problem, is_training)
 

@@ -19,9 +19,9 @@ from bavs_jax.uncertainty.draws import (
     make_displaced_render_fn,
     noise_scale,
 )
-from experiments.build import RENDER_CHUNK
-from experiments.keys import stream_key
-from experiments.progress import track
+from experiments.build import stream_key
+from experiments.build_model import RENDER_CHUNK
+from experiments.runtime import track
 from experiments.trained import TrainedRun, run_curvature, run_precision
 
 

@@ -6,16 +6,14 @@ import json
 import pathlib
 from collections.abc import Sequence
 
-from experiments import runtime, workdir
-from experiments.build import Problem, build_problem
-from experiments.build_scene import load_config_scene
-from experiments.errors import ConfigError, WorkdirError
+from experiments import runtime
+from experiments.build import Problem, load_config_scene
 from experiments.evaluate import measure_test_views
-from experiments.files import read_json, write_json
+from experiments.files import collect, is_completed, read_json, write_json
 from experiments.reporting.report import write_report
+from experiments.runtime import ConfigError, WorkdirError
 from experiments.sweeps.plan import read_record
 from experiments.trained import TrainedRun, field_kind, find_runs, load_run, saved_config
-from experiments.workdir import is_completed
 
 PSNR_TOLERANCE = 0.02  # dB; another machine adds up in another order
 
@@ -60,12 +58,12 @@ def _measure_folder(folder: pathlib.Path, command: str, lpips_net, policies, dat
     for number, (policy, seed) in enumerate(todo):
         kind = field_kind(policy)
         if kind not in problems:
-            problems[kind] = build_problem(config, scene, kind)
+            problems[kind] = Problem(config, scene, kind)
         if problems[kind].lpips_fn is None:
             raise ConfigError(f"--lpips_net: {problems[kind].lpips_reason}")
         run = load_run(config, problems[kind], folder, policy, seed)
         measure_run(run, f"{policy} seed {seed} ({number + 1} of {len(todo)})", command)
-    workdir.collect(folder)
+    collect(folder)
     print(f"report: {write_report(folder)}")
 
 

@@ -8,7 +8,6 @@ from functools import partial
 
 from experiments.bench import results as bench
 from experiments.bench.same_numbers import DEVICE_FILE, differences_table
-from experiments.errors import ReportError
 from experiments.reporting import stats, uncertainty_tables
 from experiments.reporting.results import Run, load_runs, policies_of, read_result
 from experiments.reporting.run_tables import (
@@ -21,6 +20,7 @@ from experiments.reporting.run_tables import (
     timing_table,
 )
 from experiments.reporting.tables import Cell, Collected, Table, interval_cell
+from experiments.runtime import ReportError
 from experiments.sweeps.plan import FILE as SWEEP_FILE
 from experiments.sweeps.plan import Record, read_record
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from experiments.errors import ReportError
 from experiments.reporting import stats
 from experiments.reporting.plots import PARTS
 from experiments.reporting.results import Round, Run
 from experiments.reporting.stats import REFERENCES
 from experiments.reporting.tables import Cell, Table, dash, interval_cell, seconds, signed
+from experiments.runtime import ReportError
 
 RANDOM = REFERENCES[0]
 NO_SELF_GAP = "a policy has no gap to itself"

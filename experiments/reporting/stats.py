@@ -8,8 +8,8 @@ import itertools
 import numpy as np
 from scipy.stats import t as student_t
 
-from experiments.errors import ReportError
 from experiments.reporting.results import Run
+from experiments.runtime import ReportError
 
 
 @dataclasses.dataclass(frozen=True)

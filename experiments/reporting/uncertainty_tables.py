@@ -8,11 +8,11 @@ import pathlib
 import numpy as np
 
 from bavs_jax.metrics.ause import variant_name
-from experiments.errors import ReportError
 from experiments.files import write_atomic
 from experiments.reporting import stats
 from experiments.reporting.results import read_result
 from experiments.reporting.tables import Cell, Table, dash, interval_cell
+from experiments.runtime import ReportError
 
 SCHEMA_VERSION = 2  # of uncertainty.json
 NAME = "uncertainty.json"

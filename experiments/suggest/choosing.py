@@ -36,13 +36,12 @@ from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
 from bavs_jax.uncertainty.scoring import mean_uncertainty
-from experiments.build import RENDER_CHUNK, Problem
+from experiments.build import Problem, run_key, stream_key
+from experiments.build_model import RENDER_CHUNK
 from experiments.configs import capture
 from experiments.evaluate import evaluate_views, evenly_spaced
 from experiments.files import read_arrays, write_arrays
-from experiments.keys import run_key, stream_key
-from experiments.progress import track
-from experiments.runtime import warn
+from experiments.runtime import track, warn
 from experiments.suggest.places import Options
 
 NUM_AT_ONCE = 8  # candidates between two steps of the progress bar

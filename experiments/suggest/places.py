@@ -16,8 +16,8 @@ from bavs_jax.placement.seen import focus_point, in_unknown_space, share_facing
 from bavs_jax.scenes import Scene
 from bavs_jax.scenes.pose_files import read_pose_file
 from bavs_jax.scenes.poses import transform_poses
-from experiments.errors import shown
-from experiments.keys import stream_key
+from experiments.build import stream_key
+from experiments.runtime import shown
 
 KINDS = ("shell", "hemisphere", "box", "file")
 MAX_POSES = 100_000

@@ -17,9 +17,9 @@ from bavs_jax.rendering.images import render_views
 from bavs_jax.scenes.base import photo_cameras
 from bavs_jax.scenes.poses import user_transforms
 from bavs_jax.selection.route import route_length, shortest_route
-from experiments.build import RENDER_CHUNK, Problem
+from experiments.build import Problem
+from experiments.build_model import RENDER_CHUNK
 from experiments.files import write_atomic, write_json
-from experiments.progress import track
 from experiments.reporting.page import write_template
 from experiments.reporting.pictures import (
     UNCERTAINTY_MAP,
@@ -28,7 +28,7 @@ from experiments.reporting.pictures import (
     shrink,
     uncertainty_limits,
 )
-from experiments.runtime import device_name, peak_memory_mb
+from experiments.runtime import device_name, peak_memory_mb, track
 from experiments.suggest import page
 from experiments.suggest.choosing import Suggestion, photo_rays
 from experiments.suggest.places import Options, Surroundings, photos_in_matter

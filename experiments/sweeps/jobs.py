@@ -1,29 +1,25 @@
 """Jobs of a sweep: in what order they run, where, and what is done about those that die.
 
-Nothing here knows what a job does. An engine runs one job in one of its places and says how it
-ended; `run_jobs` hands it one after another.
+Nothing here knows what a job does.
 """
 
 from __future__ import annotations
 
 import collections
+import contextlib
 import os
 import pathlib
-import queue
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from typing import NamedTuple, Protocol
+import time
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple, Protocol
 
-from experiments.errors import ConfigError
-from experiments.signals import CODES
+from experiments.runtime import ConfigError, one_line
 
-STOPPED = {code: number for number, code in CODES.items()}  # exit codes of what was asked to end
 GPU_SHARE = 0.9  # of a GPU's memory that its jobs may take together
 PATIENCE = 5.0  # seconds from asking a process to end to making it
 
@@ -41,17 +37,14 @@ class Job(NamedTuple):
 class Engine(Protocol):
     """Where jobs run."""
 
-    num_places: int  # jobs at a time
+    def start(self, job: Job) -> Any:
+        """Starts a job and returns its handle; None where there is no place for it now."""
 
-    def run(self, job: Job) -> int | None:
-        """Runs a job to its end, in a thread of its own.
+    def ended(self, handles: Iterable) -> list[tuple[Any, int | None]]:
+        """Those that have ended, with the exit status: -n: killed by signal n; None: it is gone."""
 
-        Returns:
-          its exit status; -n: killed by signal n; None: its machine is gone.
-        """
-
-    def stop(self) -> None:
-        """Ends all jobs that still run; none starts from then on."""
+    def stop(self, handles: Iterable) -> None:
+        """Ends jobs that still run."""
 
 
 class Event(NamedTuple):
@@ -73,13 +66,11 @@ def run_jobs(
     the failed one.
     """
     waiting = {job.name: job for job in jobs}
-    running, failed, attempts = {}, set(), collections.Counter()
-    threads = ThreadPoolExecutor(engine.num_places)
+    running, failed, attempts = {}, set(), collections.Counter()  # the first: jobs by handle
     try:
         while waiting or running:
-            busy = {job.name for job in running.values()}
             for job in list(waiting.values()):
-                if job.needs in waiting or job.needs in busy:
+                if job.needs in waiting or job.needs in {j.name for j in running.values()}:
                     continue
                 if job.is_finished():
                     del waiting[job.name]
@@ -88,36 +79,35 @@ def run_jobs(
                     del waiting[job.name]
                     failed.add(job.name)
                     yield Event("failed", job, f"{job.needs}, which it needs, has failed")
-                elif len(running) < engine.num_places:
-                    del waiting[job.name]
-                    busy.add(job.name)
+                elif (handle := engine.start(job)) is not None:
+                    running[handle] = waiting.pop(job.name)
                     attempts[job.name] += 1
-                    running[threads.submit(engine.run, job)] = job
                     yield Event("started", job)
-            for future in wait(running, wait_seconds, FIRST_COMPLETED).done:
-                job, code = running.pop(future), future.result()
-                died = code is None or code < 0 or code in STOPPED
+            if running:
+                time.sleep(wait_seconds)
+            for handle, code in engine.ended(running):
+                job, death = running.pop(handle), death_words(code)
                 if code == 0 and job.is_finished():
                     yield Event("finished", job)
-                elif died and attempts[job.name] <= retries:
+                elif death and attempts[job.name] <= retries:
                     waiting = {job.name: job, **waiting}  # at the head: others may wait for it
-                    yield Event("retried", job, death_words(code))
+                    yield Event("retried", job, death)
                 else:
                     failed.add(job.name)
                     again = f", {attempts[job.name]} times" if attempts[job.name] > 1 else ""
-                    reason = f"{death_words(code)}{again}" if died else last_words(job.log)
-                    yield Event("failed", job, reason)
+                    yield Event("failed", job, f"{death}{again}" if death else last_words(job.log))
             yield Event("tick")
     finally:
-        engine.stop()
-        threads.shutdown()
+        engine.stop(running)
 
 
 def death_words(code: int | None) -> str:
-    """How a process that did not end by itself came to its end."""
+    """How a process came to its end that did not end by itself; empty for one that did."""
     if code is None:
         return "its machine or its worker is gone"
-    number = STOPPED.get(code, -code)
+    number = -code if code < 0 else code - 128  # as scripts end that were asked to
+    if code >= 0 and number not in (signal.SIGINT, signal.SIGTERM):
+        return ""
     hint = "; out of memory?" if number == signal.SIGKILL else ""
     return f"killed by {signal.Signals(number).name}{hint}"
 
@@ -128,11 +118,41 @@ def last_words(log: pathlib.Path) -> str:
     return next((line.strip() for line in reversed(lines) if line.strip()), "printed nothing")
 
 
-# --- processes of this machine ---------------------------------------------------------------
+def open_process(argv, log: pathlib.Path, *, env=None, cwd=None) -> subprocess.Popen:
+    """Starts this Python with `argv`; all it prints is added to the log.
+
+    It has a session of its own, so that ctrl-C reaches only the program that started it, and its
+    standard input is a pipe, which closes when that program is killed.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with open(log, "ab", buffering=0) as file:
+        file.write(f"$ python {shlex.join(argv)}\n".encode())
+        return subprocess.Popen(
+            [sys.executable, *argv],
+            stdin=subprocess.PIPE,
+            stdout=file,
+            stderr=subprocess.STDOUT,
+            env=os.environ | (env or {}),
+            cwd=cwd,
+            start_new_session=True,
+        )
+
+
+def end_process(process: subprocess.Popen) -> None:
+    """Asks a process to end, and makes it."""
+    process.terminate()
+    try:
+        process.wait(PATIENCE)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+# --- this machine ----------------------------------------------------------------------------
 
 
 class Slot(NamedTuple):
-    """Where one job runs."""
+    """A part of this machine that one job has for itself."""
 
     cores: tuple[int, ...]
     env: dict[str, str]
@@ -147,19 +167,12 @@ def make_slots(
     cores_per_trial: int = 1,
     gb_per_trial: float = 2.0,
 ) -> list[Slot]:
-    """As many slots as fit, each with cores of its own; at least one.
-
-    Jobs that share cores hinder each other: two with one core each get more done than two with
-    both, and than one with both. Where there are GPUs, there is a slot for each, or several share
-    one if more `jobs` are asked for.
+    """Divides a machine among as many jobs as fit, at least one.
 
     Args:
-      cores: numbers of the cores that may be used.
-      memory_gb: of the host, in units of 10^9 bytes.
-      gpus: names of the GPUs.
-      jobs: most slots; 0: as many as fit.
-      cores_per_trial: least cores of a slot.
-      gb_per_trial: host memory that a job is expected to need.
+      cores, memory_gb, gpus: what there is; a job has no GPU where there is none.
+      jobs: most jobs at a time; 0: one a GPU, or as many as cores and memory allow.
+      cores_per_trial, gb_per_trial: what each of them needs.
     """
     fit = min(len(cores) // cores_per_trial, int(memory_gb / gb_per_trial))
     num = max(1, min(fit, jobs or len(gpus) or fit))
@@ -220,67 +233,32 @@ def _read(path: str) -> str:
         return ""
 
 
-def open_process(argv, log: pathlib.Path, *, env=None, cwd=None) -> subprocess.Popen:
-    """Starts this Python with `argv`; all it prints is added to the log.
-
-    It has a session of its own, so that ctrl-C reaches only the program that started it, and its
-    standard input is a pipe, which closes when that program is killed.
-    """
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with open(log, "ab", buffering=0) as file:
-        file.write(f"$ python {shlex.join(argv)}\n".encode())
-        return subprocess.Popen(
-            [sys.executable, *argv],
-            stdin=subprocess.PIPE,
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            env=os.environ | (env or {}),
-            cwd=cwd,
-            start_new_session=True,
-        )
-
-
-def end_process(process: subprocess.Popen) -> None:
-    """Asks a process to end, and makes it."""
-    process.terminate()
-    try:
-        process.wait(PATIENCE)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-
-
 class LocalEngine:
     """Each job is a process of this machine, on cores of its own."""
 
     def __init__(self, slots: list[Slot]):
-        self.num_places = len(slots)
-        self._free: queue.SimpleQueue[Slot] = queue.SimpleQueue()
-        for slot in slots:
-            self._free.put(slot)
-        self._lock, self._processes, self._stopped = threading.Lock(), set(), False
+        self._free, self._used = list(slots), {}
 
-    def run(self, job: Job) -> int | None:
-        slot = self._free.get()
-        try:
-            with self._lock:
-                if self._stopped:
-                    return None
-                if hasattr(os, "sched_setaffinity"):
-                    os.sched_setaffinity(0, slot.cores)  # of this thread, and what it starts
-                process = open_process(job.argv, job.log, env=slot.env)
-                self._processes.add(process)
-            return process.wait()
-        finally:
-            self._free.put(slot)
+    def start(self, job: Job) -> subprocess.Popen | None:
+        if not self._free:
+            return None
+        slot = self._free.pop(0)
+        process = open_process(job.argv, job.log, env=slot.env)
+        if hasattr(os, "sched_setaffinity"):
+            with contextlib.suppress(ProcessLookupError):  # it has ended already
+                os.sched_setaffinity(process.pid, slot.cores)
+        self._used[process] = slot
+        return process
 
-    def stop(self) -> None:
-        with self._lock:
-            self._stopped = True
-        left = [process for process in self._processes if process.poll() is None]
-        for process in left:
+    def ended(self, handles):
+        done = [process for process in handles if process.poll() is not None]
+        self._free += [self._used.pop(process) for process in done]
+        return [(process, process.returncode) for process in done]
+
+    def stop(self, handles):
+        for process in handles:
             process.terminate()
-        for process in left:
+        for process in handles:
             end_process(process)
 
 
@@ -296,8 +274,6 @@ class RayEngine:
     worker, and so with its machine.
     """
 
-    num_places = 1000
-
     def __init__(self, address: str | None = None, cores_per_trial: int = 1):
         try:
             import ray
@@ -309,34 +285,30 @@ class RayEngine:
         except ConnectionError as error:
             raise ConfigError(f"--ray_address: {' '.join(str(error).split())}") from None
         gpus = 1 if ray.cluster_resources().get("GPU") else 0
-        self._task = ray.remote(
-            num_cpus=cores_per_trial, num_gpus=gpus, max_retries=0, max_calls=1
-        )(_run_process)
+        resources = {"num_cpus": cores_per_trial, "num_gpus": gpus}
+        self._task = ray.remote(**resources, max_retries=0, max_calls=1)(_run_process)
         self._env = {"NPROC": str(cores_per_trial)}
-        self._lock, self._running, self._stopped = threading.Lock(), set(), False
 
-    def run(self, job: Job) -> int | None:
-        with self._lock:
-            if self._stopped:
-                return None
-            ref = self._task.remote(job.argv, str(job.log.absolute()), self._env, os.getcwd())
-            self._running.add(ref)
+    def start(self, job: Job):
+        return self._task.remote(job.argv, str(job.log.absolute()), self._env, os.getcwd())
+
+    def ended(self, handles):
+        handles = list(handles)
+        done, _ = self._ray.wait(handles, num_returns=len(handles), timeout=0)
+        return [(ref, self._code(ref)) for ref in done]
+
+    def _code(self, ref) -> int | None:
         try:
             return self._ray.get(ref)
         except self._ray.exceptions.RayTaskError as error:
             # The worker lives, but could not even start the process.
-            with open(job.log, "a", encoding="utf-8") as file:
-                file.write(f"{error}\n")
+            print(f"ray: {one_line(error)}", flush=True)
             return 1
         except self._ray.exceptions.RayError:
             return None
-        finally:
-            self._running.discard(ref)
 
-    def stop(self) -> None:
-        with self._lock:
-            self._stopped = True
-        if left := list(self._running):
+    def stop(self, handles):
+        if left := list(handles):
             for ref in left:
                 self._ray.cancel(ref, force=True)
             self._ray.wait(left, num_returns=len(left), timeout=PATIENCE)

@@ -27,12 +27,11 @@ from bavs_jax.uncertainty.bands import (
 )
 from bavs_jax.uncertainty.conformal_report import coverage_report, to_json
 from bavs_jax.uncertainty.conformal_scale import ViewErrors, ViewGroups, split_views
-from experiments.build import RENDER_CHUNK
-from experiments.errors import ConfigError, WorkdirError
+from experiments.build_model import RENDER_CHUNK
 from experiments.evaluate import evenly_spaced
 from experiments.files import read_versioned, write_json
-from experiments.progress import track
 from experiments.reporting.uncertainty import LEVEL
+from experiments.runtime import ConfigError, WorkdirError, track
 
 SCHEMA_VERSION = 1  # of a calibration's file
 PIXEL_SEED = 0  # the same pixels of a view for every model and seed

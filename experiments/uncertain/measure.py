@@ -21,14 +21,13 @@ from bavs_jax.metrics.ause import ERRORS, Sparsification, mean_sparsification, v
 from bavs_jax.rendering.images import render_views
 from bavs_jax.uncertainty.bands import uncertainty_of
 from bavs_jax.uncertainty.model import Acquired
-from experiments.build import RENDER_CHUNK, Problem
+from experiments.build import Problem, stream_key
+from experiments.build_model import RENDER_CHUNK
 from experiments.evaluate import evenly_spaced, mean_quality
 from experiments.files import read_arrays, read_json, stack_pictures, write_arrays, write_json
-from experiments.keys import stream_key
-from experiments.progress import track
 from experiments.reporting.uncertainty import write_page
 from experiments.reporting.uncertainty_tables import NAME, SCHEMA_VERSION, save_result
-from experiments.runtime import code_commit, device_name, versions
+from experiments.runtime import code_commit, device_name, track, versions
 from experiments.trained import FIRST_ROUND, train_run
 from experiments.uncertain import intervals
 
