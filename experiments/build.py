@@ -38,6 +38,7 @@ from experiments.build_model import (
     build_flow,
     build_model,
     build_trainer,
+    only,
     train_aside,
 )
 from experiments.runtime import ConfigError
@@ -74,22 +75,16 @@ def stream_key(seed: int, stream: str) -> jax.Array:
 
 
 def load_config_scene(config, *, cache_dir: str | None) -> Scene:
-    """The scene that a config names, from its `data_dir` or from $BAVS_DATA.
-
-    Raises:
-      SceneError: neither is given, or the scene's files cannot be used.
-    """
+    """The scene that a config names; SceneError if its files cannot be used."""
     if config.loader == "procedural":
         return load_scene("procedural", image_size=config.image_size, cache_dir=cache_dir)
-    folder = config.data_dir
-    if not folder:
-        if not os.environ.get("BAVS_DATA"):
-            raise SceneError(
-                "config.data_dir: is empty and BAVS_DATA is not set: "
-                "pass --config.data_dir=FOLDER_OF_SCENES"
-            )
-        folder = os.path.join(os.environ["BAVS_DATA"], config.loader)
-    root = os.path.join(folder, config.scene)
+    folder, default = config.data_dir, os.environ.get("BAVS_DATA")
+    if not folder and not default:
+        raise SceneError(
+            "config.data_dir: is empty and BAVS_DATA is not set: "
+            "pass --config.data_dir=FOLDER_OF_SCENES"
+        )
+    root = os.path.join(folder or os.path.join(default, config.loader), config.scene)
     options = {name: value for name, value in config.load.items() if value}
     if options.get("pool_size", 0.0) >= 1:
         options["pool_size"] = int(options["pool_size"])
@@ -121,12 +116,7 @@ def _takes_pictures(config) -> bool:
 
 
 def check_views(config, scene: Scene) -> None:
-    """Whether a scene has as many views as a config's rounds ask for, before any is trained.
-
-    Raises:
-      SceneError: the pool has fewer than `num_initial`.
-      ConfigError: it has fewer than all batches take, or a batch more than its candidates.
-    """
+    """Raises an error, before any training, if a scene has fewer views than the rounds ask for."""
     batch, num_rounds, options = config.batch_size, config.num_rounds, config.candidates
     left = len(scene.pool) - len(initial_views(scene, 0, config.num_initial))
     taken, draws = num_rounds * batch, options.hemisphere_draws
@@ -181,14 +171,11 @@ class Problem:
         """Puts models, training, curvature and selection together; compiles nothing yet.
 
         Args:
-          config: see `experiments/configs/base.py`; `check_config` has seen it.
+          config: see `experiments/configs/base.py`; raises ConfigError where it does not fit.
           scene: the scene.
           kind: of the field that is trained and measured, one of `KINDS`.
           mesh: devices that share the rays, from `make_mesh`.
           track: how progress is shown: (total, label, unit) -> a context with `advance(n)`.
-
-        Raises:
-          ConfigError: an option that cannot be used.
         """
         check_shards(config, mesh)
         self.config, self.scene, self.kind = config, scene, kind
@@ -216,16 +203,16 @@ class Problem:
         self.grid = DeformationGrid(
             jnp.asarray(scene.box), uncertainty.log2_cells, contracted=scene.unbounded
         )
+        channel = ("variant", "scale", "extent")
         prior_weight = uncertainty.prior_weight or default_prior_weight(uncertainty.log2_cells)
         self.laplace = LaplaceOptions(
             prior_weight=prior_weight / float(offset_unit(scene.box)) ** 2,
-            weighting=uncertainty.weighting,
-            variant=uncertainty.variant,
-            scale=uncertainty.scale,
-            extent=uncertainty.extent,
             max_rays=uncertainty.max_rays or None,
-            offset_cells=uncertainty.offset_cells,
+            **only(uncertainty, "weighting", "offset_cells", *channel),
         )
+        look = only(uncertainty, *channel)
+        self._render_chunk = make_render_chunk_fn(self.model, self.grid, mesh=mesh, **look)
+        self._density = jax.jit(self.model.density)
         self.lpips_fn, self.lpips_reason = None, "switched off: config.lpips_net is empty"
         if config.lpips_net:
             self.lpips_fn, self.lpips_reason = make_lpips_fn(config.lpips_net)
@@ -265,18 +252,9 @@ class Problem:
             variance = laplace_variance(jac_sq_sum, num_rays, self.laplace)
         return partial(self._render_chunk, train.model, variance)
 
-    @cached_property
-    def _render_chunk(self) -> Callable:
-        options = {name: getattr(self.laplace, name) for name in ("variant", "scale", "extent")}
-        return make_render_chunk_fn(self.model, self.grid, mesh=self.mesh, **options)
-
     def density(self, train: TrainState, positions) -> jax.Array:
         """At points [K, 3]: [K] 1 / scene unit, 0 where nothing is rendered."""
-        return self._density_fn(train.model, positions)
-
-    @cached_property
-    def _density_fn(self) -> Callable:
-        return jax.jit(self.model.density)
+        return self._density(train.model, positions)
 
     @cached_property
     def setup(self) -> SceneSetup:

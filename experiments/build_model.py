@@ -42,7 +42,8 @@ LEARNING_RATES = {"hash_grid": 1e-2, "nerf_mlp": 1e-3, "mip_mlp": 1e-3}
 TRUNK = ("depth", "width", "skip", "position_degree", "direction_degree")  # of the networks
 
 
-def _only(options, *names: str) -> dict:
+def only(options, *names: str) -> dict:
+    """Some options of a group, as keyword arguments of the same names."""
     return {name: options[name] for name in names}
 
 
@@ -54,14 +55,8 @@ def build_field(
 ) -> tuple[Field, Sampler]:
     """The radiance field that a config names, and how rays are sampled for it.
 
-    Args:
-      config: see `experiments/configs/base.py`.
-      scene: the scene; an unbounded one is contracted, and sampled by proposals.
-      num_views: views of the pixel table, some of them possibly still empty.
-      learned_variance: whether the field also learns a variance of its colours.
-
-    Raises:
-      ConfigError: kinds that do not go together.
+    An unbounded scene is contracted, and sampled by proposals. `num_views` are those of the pixel
+    table. Raises ConfigError for kinds that do not go together.
     """
     kind, box, contracted = config.field_kind, scene.box, scene.unbounded
     # An occupancy grid ends at the box.
@@ -85,7 +80,7 @@ def build_field(
     elif kind == "nerf_mlp":
         field = nerf_mlp.make_nerf_mlp_field(box, **config.nerf_mlp, **options)
     else:
-        options |= _only(config.mip_mlp, *TRUNK) | {"pixel_radius": _pixel_radius(scene)}
+        options |= only(config.mip_mlp, *TRUNK) | {"pixel_radius": _pixel_radius(scene)}
         field = nerf_mlp.make_nerf_mlp_field(box, **options)
     return field, _build_sampler(config, scene, sampler_kind)
 
@@ -97,7 +92,7 @@ def build_flow(config, scene: Scene) -> FlowField:
         aside = ("appearance_features", "initial_optical_depth")
         grid = {k: v for k, v in config.hash_grid.items() if k not in aside}
         return flow_field.make_flow_field(scene.box, **grid, **common)
-    trunk = _only(config[config.field_kind], *TRUNK)
+    trunk = only(config[config.field_kind], *TRUNK)
     return flow_field.make_flow_mlp_field(scene.box, **trunk, **common)
 
 
@@ -117,7 +112,7 @@ def _background(scene: Scene) -> np.ndarray | None:
 def _build_sampler(config, scene: Scene, kind: str) -> Sampler:
     near, far, box = scene.near, scene.far, scene.box
     if kind == "occupancy":
-        limits = _only(config.march, "num_steps", "num_slots")
+        limits = only(config.march, "num_steps", "num_slots")
         march_options = make_march_options(box, near=near, far=far, **limits)
         return make_occupancy_sampler(
             box, march_options, resolution=config.march.occupancy_resolution
@@ -149,12 +144,12 @@ def _build_sampler(config, scene: Scene, kind: str) -> Sampler:
             f"{len(options.num_proposals)} in num_proposals; give as many"
         )
     else:
-        shape = _only(options, "num_levels", "coarsest", "log2_table_size", "width")
+        shape = only(options, "num_levels", "coarsest", "log2_table_size", "width")
         shape["contracted"] = scene.unbounded
         make = partial(hash_grid.make_hash_grid_density, box, **shape)
         densities = [make(finest=finest) for finest in options.finest]
-    weights = _only(options, "interlevel_weight", "distortion_weight", "penalty_weight")
-    counts = _only(options, "num_proposals", "num_samples", "anneal_steps")
+    weights = only(options, "interlevel_weight", "distortion_weight", "penalty_weight")
+    counts = only(options, "num_proposals", "num_samples", "anneal_steps")
     return make_proposal_sampler(densities, interval_fn, **counts, **weights)
 
 
@@ -169,18 +164,11 @@ def build_model(
     flow: FlowField,
     mesh: Mesh | None = None,
 ) -> RayField:
-    """The model of one kind; compiles nothing yet.
+    """The model of one of `KINDS`; compiles nothing yet.
 
-    Args:
-      config: see `experiments/configs/base.py`.
-      scene: the scene.
-      num_views: views of the pixel table.
-      kind: one of `KINDS`.
-      flow: the distribution over fields whose mean is the field of kind FLOW.
-      mesh: devices that share the rays and the sample buffer.
-
-    Raises:
-      ConfigError: options that do not go together.
+    `num_views` are those of the pixel table; the devices of a `mesh` share rays and sample buffer;
+    the mean of `flow` is the field of kind FLOW. Raises ConfigError for options that do not go
+    together.
     """
     field, sampler = build_field(config, scene, num_views, learned_variance=kind == VARIANCE)
     train = config.train
@@ -202,7 +190,7 @@ def build_model(
         objective,
         rays_per_pixel=config.rays_per_pixel,
         capacity_before_hiding=train.look_ahead * capacity,
-        **_only(train, "num_rays", "random_background", "penalty_weight", "roughness_weight"),
+        **only(train, "num_rays", "random_background", "penalty_weight", "roughness_weight"),
     )
     return RayField(
         field,
@@ -227,7 +215,7 @@ def build_trainer(config, model: RayField) -> Trainer:
         warmup=train.warmup_steps,
         second_decay=train.adam_b2,
         epsilon=train.adam_eps,
-        **_only(train, "final_share", "num_steps", "max_grad_norm"),
+        **only(train, "final_share", "num_steps", "max_grad_norm"),
     )
 
     def call_of(rays_per_pixel: int):
@@ -237,7 +225,7 @@ def build_trainer(config, model: RayField) -> Trainer:
             optimiser,
             schedule,
             mesh=model.mesh,
-            **_only(train, "average_age", "steps_per_call"),
+            **only(train, "average_age", "steps_per_call"),
         )
 
     call = later = call_of(config.rays_per_pixel)

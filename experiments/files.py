@@ -16,7 +16,7 @@ from ml_collections import ConfigDict
 
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.uncertainty.model import RECONSTRUCTION
-from experiments.runtime import ConfigError, WorkdirError, is_first_process, warn
+from experiments.runtime import WorkdirError, is_first_process, reason, warn
 
 SUMMARY_VERSION = 1
 PICTURES = ("truth", "rgb", "error", "uncertainty", "depth")
@@ -34,10 +34,8 @@ def _named_errors(path: str | os.PathLike) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise WorkdirError(
-            f"{path}: cannot be written ({error.strerror or error}): make room there, then start "
-            "again"
-        ) from error
+        fix = "make room there, then start again"
+        raise WorkdirError(f"{path}: cannot be written ({reason(error)}): {fix}") from error
 
 
 def write_atomic(path: str | os.PathLike, write_fn: Callable) -> None:
@@ -117,12 +115,7 @@ def exclusive(folder: str | os.PathLike, *, wait: bool = True) -> Iterator[None]
 
 
 def load_json(path: str | os.PathLike) -> dict:
-    """A JSON object.
-
-    Raises:
-      FileNotFoundError: there is no file.
-      ValueError: it is damaged; names the file.
-    """
+    """A JSON object; FileNotFoundError, or a ValueError that names a damaged file."""
     try:
         value = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
@@ -133,12 +126,7 @@ def load_json(path: str | os.PathLike) -> dict:
 
 
 def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
-    """The arrays of an `.npz`.
-
-    Raises:
-      FileNotFoundError: there is no file.
-      ValueError: it is damaged or lacks one of `names`; names the file.
-    """
+    """The arrays of an `.npz`; an error as in `load_json`, also where one of `names` is missing."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -169,10 +157,10 @@ def _read(load_fn: Callable, path, *names: str, otherwise: str):
     try:
         return load_fn(path, *names)
     except FileNotFoundError:
-        return None
+        pass
     except ValueError as error:
         warn(f"{error}: {otherwise}")
-        return None
+    return None
 
 
 def read_versioned(
@@ -180,15 +168,8 @@ def read_versioned(
 ) -> dict:
     """The content of a JSON object whose `schema_version` this program knows.
 
-    Args:
-      path: of the file.
-      version: that it must have.
-      error: what to raise.
-      absent: what to do where there is no file, in the imperative.
-      fix: what to do where it is broken or of another version.
-
-    Raises:
-      error: one line that names the file, the field and the fix.
+    If it cannot be used, an `error` names the file, the field and what to do: `absent` where there
+    is no file, `fix` where it is broken or of another version.
     """
     try:
         content = load_json(path)
@@ -196,8 +177,7 @@ def read_versioned(
         raise error(f"{path}: no such file; {absent}") from None
     except ValueError as problem:
         raise error(f"{problem}; {fix}") from None
-    found = content.get("schema_version")
-    if found != version:
+    if (found := content.get("schema_version")) != version:
         raise error(f"{path}: schema_version is {found}, this program reads {version}; {fix}")
     return content
 
@@ -212,21 +192,18 @@ def stack_pictures(images: list[np.ndarray]) -> np.ndarray:
 
 
 def cut_pictures(arrays: dict) -> dict:
-    """The content of a file of pictures, each picture again at its own size.
+    """The content of a file of pictures, each of `PICTURES` a list of images [H_v, W_v, ...].
 
-    Args:
-      arrays: `PICTURES` as from `stack_pictures`, and `sizes` [n, 2] (width, height), without
-        which all are of one size.
-
-    Returns:
-      The same, with a list of [H_v, W_v, ...] in place of each array of `PICTURES`.
+    `sizes` [n, 2] (width, height) says how large they are; without, all are of one size.
     """
-    sizes, names = arrays.get("sizes", ()), [name for name in PICTURES if name in arrays]
-    cut = {
-        name: [image[:height, :width] for image, (width, height) in zip(arrays[name], sizes)]
-        for name in names
-    }
-    return arrays | cut if len(sizes) else arrays
+    if "sizes" not in arrays:
+        return arrays
+    cut = {}
+    for name in PICTURES:
+        if name in arrays:
+            pairs = zip(arrays[name], arrays["sizes"])
+            cut[name] = [image[:height, :width] for image, (width, height) in pairs]
+    return arrays | cut
 
 
 # --- parts of an experiment ------------------------------------------------------------------
@@ -255,21 +232,9 @@ class Part(NamedTuple):
 
 
 def all_parts(policies, seeds) -> list[Part]:
-    """Every part of an experiment, round 0 before what starts from it, seed by seed.
-
-    Raises:
-      SelectionError: a policy that does not exist.
-    """
+    """Every part of an experiment, round 0 before what starts from it, seed by seed."""
     parts = [Part(p, get_policy(p).field_kind, seed) for seed in seeds for p in policies]
     return list(dict.fromkeys(p for part in parts for p in (part.initial, part)))
-
-
-def find_part(name: str, parts: list[Part]) -> Part:
-    """The part of that name; raises ConfigError with the known names if there is none."""
-    known = {part.name: part for part in parts}
-    if name not in known:
-        raise ConfigError(f"--part: {name!r} is not part of this config; use one of {(*known,)}")
-    return known[name]
 
 
 def is_finished(workdir: pathlib.Path, part: Part) -> bool:
@@ -306,11 +271,7 @@ def leaves(config, prefix: str = "") -> dict:
 
 
 def check_claim(workdir: pathlib.Path, config) -> None:
-    """Checks that what was made in a folder was made with the same config; writes nothing.
-
-    Raises:
-      WorkdirError: it holds a run of another config, or of one that cannot be read.
-    """
+    """Raises WorkdirError if a folder holds runs of another config; writes nothing."""
     path = workdir / "config.json"
     checkpoints = (p.name.isdigit() for p in workdir.glob("*/seed_*/checkpoints/*"))
     has_work = any(checkpoints) or any(workdir.glob("*/seed_*/result.json"))
@@ -333,11 +294,7 @@ def check_claim(workdir: pathlib.Path, config) -> None:
 
 
 def claim(workdir: pathlib.Path, config) -> None:
-    """Makes a folder and its `config.json`; to be called when all else has been checked.
-
-    Raises:
-      WorkdirError: see `check_claim`.
-    """
+    """Makes a folder and its `config.json`; to be called when all else has been checked."""
     check_claim(workdir, config)
     write_json(workdir / "config.json", config.to_dict())
 

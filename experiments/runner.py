@@ -34,7 +34,7 @@ from experiments.build_model import train_with_bar
 from experiments.files import Part, load_arrays, write_arrays, write_json
 from experiments.reporting.report import write_report
 from experiments.reporting.results import bound_words
-from experiments.runtime import WorkdirError, is_first_process, warn
+from experiments.runtime import ConfigError, WorkdirError, is_first_process, warn
 
 SCHEMA_VERSION = 1
 LOG_EVERY = 10  # training calls between two lines of metrics.jsonl
@@ -63,8 +63,7 @@ class Run:
     def finish(self, shared: Run | None = None) -> None:
         """Goes on from the last checkpoint to the last round and writes all files of the run.
 
-        Args:
-          shared: the finished run of round 0 to start from; None to make round 0 here.
+        Without a checkpoint it goes on from the finished run of round 0 that is `shared`.
         """
         state = self._restored(self) or (shared and self._restored(shared)) or self._fresh()
         if self.policy and not files.is_finished(self.workdir, self.part):
@@ -149,8 +148,9 @@ class Run:
             if at_end:
                 pending["stuck"] = problem.is_stuck(info, state)
             if fitted.calls % LOG_EVERY == 0 or at_end:
-                step, psnr = fitted.calls * self.config.train.steps_per_call, _psnr(info.loss)
-                self._log("train", number, step=step, loss=loss, psnr=psnr, **shape)
+                step = fitted.calls * self.config.train.steps_per_call
+                numbers = {"loss": loss, "psnr": float(-10 * jnp.log10(info.loss))}
+                self._log("train", number, step=step, **numbers, **shape)
             due = time.monotonic() - saved > self.config.checkpoint_seconds
             if runtime.as_first_process(due) or at_end:
                 self._save(state)
@@ -269,10 +269,6 @@ def _new_pending() -> dict:
     return {"selected": [], "seconds": seconds, "restarts": 0, "stuck": False}
 
 
-def _psnr(loss: jax.Array) -> float:
-    return float(-10 * jnp.log10(loss))
-
-
 def saved_part(problem: Problem, state: ActiveState):
     """The state without the scene's own pixels, which its files hold already."""
     saved = {
@@ -331,11 +327,7 @@ def save_choice(folder: pathlib.Path, number: int, choice: Choice, *, in_scene: 
 
 
 def load_choices(folder: pathlib.Path, num_rounds: int) -> list[dict[str, np.ndarray]]:
-    """The choices of rounds 1 .. num_rounds.
-
-    Raises:
-      WorkdirError: one is missing or damaged; the field that made it is no more.
-    """
+    """The choices of rounds 1 .. num_rounds; WorkdirError if one is missing or damaged."""
     try:
         return [load_arrays(_choice_path(folder, n)) for n in range(1, num_rounds + 1)]
     except (FileNotFoundError, ValueError) as error:
@@ -404,17 +396,14 @@ def run_all(
 ) -> None:
     """Every policy with every seed, each from the round 0 it shares; then views and report.
 
-    Args:
-      config: from `given_config`.
-      folder: for all results.
-      command: kept in the result files.
-      mesh: devices that share the rays.
-      only: the name of a part, such as `bavs/seed_0`, to make just that.
+    `command` is kept in the result files. `only` names a part, such as `bavs/seed_0`, to make just
+    that.
     """
     start = time.monotonic()
-    parts = files.all_parts(config.policies, config.seeds)
-    if only is not None:
-        parts = [files.find_part(only, parts)]
+    known = {part.name: part for part in files.all_parts(config.policies, config.seeds)}
+    if only is not None and only not in known:
+        raise ConfigError(f"--part: {only!r} is not part of this config; use one of {(*known,)}")
+    parts = [*known.values()] if only is None else [known[only]]
     files.check_claim(folder, config)
     scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     check_views(config, scene)
@@ -429,7 +418,7 @@ def run_all(
             run.finish(shared)
             return run
 
-    first_rounds = {}
+    first_rounds: dict[Part, Run] = {}
     for part in parts:
         if part.initial not in first_rounds:
             first_rounds[part.initial] = make(part.initial)

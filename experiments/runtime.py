@@ -77,6 +77,11 @@ def one_line(error: Exception) -> str:
     return " ".join(dict.fromkeys([lines[0], lines[-1]])) if lines else type(error).__name__
 
 
+def reason(error: Exception) -> str:
+    """What was wrong, without the name of the file that an OSError repeats."""
+    return getattr(error, "strerror", None) or str(error)
+
+
 @functools.cache
 def warn(text: str) -> None:
     """A line on standard error, for what goes on all the same; said once."""
@@ -156,8 +161,7 @@ def end_with_parent() -> None:
 def given_folder(flag: str, hint: str, *, exists: bool = False) -> pathlib.Path:
     """The folder that a flag names, which can be made or, if it `exists` already, read.
 
-    Raises:
-      ConfigError: there is no name, or none of a folder that can be used.
+    Raises ConfigError with a `hint` of what to name if it cannot be used.
     """
     text = FLAGS[flag].value
     if not text:
@@ -171,9 +175,8 @@ def given_folder(flag: str, hint: str, *, exists: bool = False) -> pathlib.Path:
         if not exists and not os.access(found, os.W_OK | os.X_OK):
             raise PermissionError(f"no permission to write into {found}")
     except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"--{flag}: {shown(text)} cannot be used ({error}); name {hint}"
-        ) from None
+        why = f"{shown(text)} cannot be used ({reason(error)})"
+        raise ConfigError(f"--{flag}: {why}; name {hint}") from None
     return path
 
 
@@ -181,13 +184,9 @@ def given_folder(flag: str, hint: str, *, exists: bool = False) -> pathlib.Path:
 
 
 def cache_folder(given: str = "") -> pathlib.Path | None:
-    """Where scenes and compiled programs are kept: `bavs_jax` in $XDG_CACHE_HOME or ~/.cache.
+    """Where scenes and compiled programs are kept: `given`, or `bavs_jax` in the user's cache.
 
-    Args:
-      given: a folder to use in its place.
-
-    Returns:
-      The folder, which is there; None, after a warning, if nothing can be written to it.
+    It is there; None, after a warning, if nothing can be written to it.
     """
     root = given or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     try:
@@ -197,7 +196,7 @@ def cache_folder(given: str = "") -> pathlib.Path | None:
             file.write(bytes(4096))
     except (OSError, ValueError, RuntimeError) as error:  # the last: a user without a home
         warn(
-            f"{printable(root)}: cannot be used ({error}): goes on without a cache; set "
+            f"{printable(root)}: cannot be used ({reason(error)}): goes on without a cache; set "
             "XDG_CACHE_HOME or --compilation_cache_dir to have one"
         )
         return None
@@ -251,11 +250,7 @@ def as_first_process(value: bool) -> bool:
 
 
 def define_device_flags() -> None:
-    """Gives a script the flags of `start_devices`.
-
-    With `--coordinator` the same command is started once for each process, on machines that share
-    the working folder: all of them compute, the first one writes.
-    """
+    """Gives a script the flags of `start_devices`."""
     of_first = "With --coordinator: "
     flags.DEFINE_integer("devices", 1, "Devices that share the rays of a run; 0: all.", 0)
     flags.DEFINE_string(
@@ -269,10 +264,9 @@ def define_device_flags() -> None:
 def start_devices() -> Mesh | None:
     """Joins the other processes, says which devices are used, and makes their mesh.
 
-    Must come before anything is computed. Processes other than the first print nothing.
-
-    Raises:
-      ConfigError: flags that cannot be used.
+    With `--coordinator` the same command is started once for each process, on machines that share
+    the working folder: all of them compute, the first one prints and writes. Must come before
+    anything is computed. Raises ConfigError for flags that cannot be used.
     """
     if not FLAGS.coordinator and FLAGS.num_processes != 1:
         raise ConfigError("--num_processes: needs --coordinator, the host:port of the first one")
@@ -357,14 +351,8 @@ def track(
 ) -> Iterator[Task]:
     """Shows how far a piece of work is, how fast it goes and when it will end.
 
-    On a terminal it is a bar, elsewhere a line every `PLAIN_INTERVAL` seconds and at the end.
-
-    Args:
-      total: how many units the work has.
-      description: what is being done, in a word or two.
-      unit: what is counted, in the plural.
-      stream: where to write; standard output by default.
-      clock: seconds since some moment; another one is of use in tests.
+    It has `total` units. On a terminal there is a bar, elsewhere a line every `PLAIN_INTERVAL`
+    seconds and at the end. The library never imports this: scripts pass it on as a callback.
 
     Yields:
       A `Task`; call its `advance(n, loss=loss)` as the work goes on.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 from absl import flags
@@ -41,29 +42,28 @@ class Option(NamedTuple):
     fits: Callable  # value -> bool
 
 
-def whole(low: int, high: int, zero: str = "", *, note: str = "") -> Option:
-    """A whole number, and 0 where it has a meaning of its own; the `note` says what limits it."""
-    words = f"a whole number from {low:,} to {high:,}" + (f", or 0: {zero}" if zero else "")
-    words += f" ({note})" if note else ""
-    return Option(words, lambda x: type(x) is int and (low <= x <= high or (x == 0 and bool(zero))))
+def number(low, high, zero: str = "", *, types=(int, float), above=False, note="") -> Option:
+    """A finite number, and 0 where that has a meaning of its own.
 
-
-def number(low: float, high: float, zero: str = "", *, above: bool = False) -> Option:
-    """A finite number, `above` the low end where that is left out."""
-    words = f"a number {'above' if above else 'from'} {low:g} to {high:g}"
+    `above` leaves the low end out; the `note` says what limits the number.
+    """
+    form = "," if types == (int,) else "g"
+    words = "a whole number" if types == (int,) else "a number"
+    words += f" {'above' if above else 'from'} {low:{form}} to {high:{form}}"
+    words += (f", or 0: {zero}" if zero else "") + (f" ({note})" if note else "")
 
     def fits(value):
-        if type(value) not in (int, float):
+        if type(value) not in types:
             return False
         inside = low < value <= high if above else low <= value <= high
         return inside or (value == 0 and bool(zero))
 
-    return Option(words + (f", or 0: {zero}" if zero else ""), fits)
+    return Option(words, fits)
 
 
-def positive(high: float, zero: str = "") -> Option:
-    """A number above 0."""
-    return number(0.0, high, zero, above=True)
+whole = partial(number, types=(int,))
+positive = partial(number, 0.0, above=True)
+views = partial(whole, 1, 100_000)
 
 
 def choice(*known: str) -> Option:
@@ -82,11 +82,6 @@ def several(item: Option, least: int, most: int, *, distinct: bool = True) -> Op
 
     once = ", each once" if distinct else ""
     return Option(f"a tuple of {least:,} to {most:,}{once}: {item.wanted}", fits)
-
-
-def views(zero: str = "") -> Option:
-    """A count of views."""
-    return whole(1, 100_000, zero)
 
 
 def _is_seed_text(value) -> bool:
@@ -211,18 +206,12 @@ OLD_VALUES = {
 
 
 def given_config(example: str = "") -> ConfigDict | None:
-    """The config that the flags give, checked; None if they give none and no `example` is due.
-
-    Raises:
-      ConfigError: it is missing, cannot be read, or holds an option that cannot be used.
-    """
+    """The config that the flags give, checked; None if they give none and no `example` is due."""
     config = flags.FLAGS.config
-    if config is None:
-        if example:
-            raise ConfigError(f"--config: is missing; try --config={example}")
-        return None
+    if config is None and example:
+        raise ConfigError(f"--config: is missing; try --config={example}")
     try:
-        return check_config(config)
+        return None if config is None else check_config(config)
     except OSError as error:  # the config file is only read when it is first used
         raise ConfigError(f"--config: {one_line(error)}") from None
 
@@ -260,14 +249,9 @@ def check_config(config: ConfigDict, *more: str, name: str = "config") -> Config
 def check_options(config: ConfigDict, schema: dict[str, Option], name: str, old=None) -> dict:
     """The options of a config by their dotted names, each checked by itself.
 
-    Args:
-      config: that a script was given.
-      schema: what each option may be.
-      name: what errors call the config.
-      old: by option, old names of values and the new ones, which are put in their place.
-
-    Raises:
-      ConfigError: one that cannot be used, is missing or is not in the schema.
+    `name` is what errors call the config; `old` has, by option, old names of values and the new
+    ones, which are put in their place. Raises ConfigError for an option that cannot be used, is
+    missing or is not in the schema.
     """
     if not isinstance(getattr(config, "items", None), Callable):
         raise ConfigError(f"--{name}: get_config() returns {shown(config)}; return a ConfigDict")

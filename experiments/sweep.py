@@ -48,7 +48,7 @@ flags.DEFINE_string("ray_address", None, "ray: the cluster; the one this machine
 flags.DEFINE_integer("retries", 2, "How often a trial is started again whose worker died.", 0)
 
 
-def make_engine() -> jobs.Engine:
+def make_engine() -> jobs.LocalEngine | jobs.RayEngine:
     """The engine that the flags name."""
     if FLAGS.engine == "ray":
         return jobs.RayEngine(FLAGS.ray_address, FLAGS.cores_per_trial)
@@ -79,15 +79,20 @@ def claim_folders(settings: list[plan.Setting], folder: pathlib.Path) -> plan.Re
     return record
 
 
+def num_rounds(trial: plan.Trial) -> int:
+    """That a trial has to train; round 0 is a trial of its own."""
+    return trial.setting.config.num_rounds if trial.part.policy else 1
+
+
 def rounds_done(trial: plan.Trial) -> float:
-    """Of a trial, by the number of its last checkpoint (`Run._save`); parts of one count."""
+    """How many of them are trained, by the number of the last checkpoint (see `Run._save`)."""
     train = trial.setting.config.train
     num_calls = -(-train.num_steps // train.steps_per_call)
     folder = trial.setting.folder / trial.part.name / "checkpoints"
     number = max((int(p.name) for p in folder.glob("*") if p.name.isdigit()), default=0)
     attempt, calls = divmod(number, num_calls + 2)
     done = attempt // (MAX_RESTARTS + 1) + min(calls / num_calls, 1.0)
-    return max(done - 1.0, 0.0) if trial.part.policy else done  # round 0 is another trial's
+    return max(done - 1.0, 0.0) if trial.part.policy else done
 
 
 def run_trials(trials: list[plan.Trial], record: plan.Record, folder: pathlib.Path) -> int:
@@ -95,39 +100,37 @@ def run_trials(trials: list[plan.Trial], record: plan.Record, folder: pathlib.Pa
 
     Failures are noted in the record, and struck out when they are made good.
     """
-    by_name = {trial.job.name: trial for trial in trials}
-    steps = {t.job.name: t.setting.config.train.num_steps for t in trials}
-    rounds = {t.job.name: t.setting.config.num_rounds if t.part.policy else 1 for t in trials}
-    done = {name: rounds_done(trial) for name, trial in by_name.items()}
-    states = dict.fromkeys(by_name, "waiting")
+    done = {trial.name: rounds_done(trial) for trial in trials}
+    states = dict.fromkeys(done, "waiting")
 
     def steps_done() -> int:
-        for name, state in states.items():
-            if state != "waiting":
-                ended = state in ("finished", "failed")
-                done[name] = rounds[name] if ended else rounds_done(by_name[name])
-        return int(sum(done[name] * steps[name] for name in done))
+        for trial in trials:
+            if states[trial.name] in ("finished", "failed"):
+                done[trial.name] = num_rounds(trial)
+            elif states[trial.name] == "started":
+                done[trial.name] = rounds_done(trial)
+        return int(sum(done[t.name] * t.setting.config.train.num_steps for t in trials))
 
     def note_end(trial: plan.Trial, reason: str) -> None:
         name = f"{trial.setting.name}/{trial.part.name}"
         record.failed.pop(name, None)
         if reason:
-            record.failed[name] = f"failed: {reason} (log: {trial.job.log})"
+            record.failed[name] = f"failed: {reason} (log: {trial.log})"
         elif trial.part.policy:
             files.collect(trial.setting.folder)
         plan.write_record(folder, record)
 
     shown = steps_done()
-    total = sum(steps[name] * rounds[name] for name in by_name) - shown
-    events = jobs.run_jobs([t.job for t in trials], make_engine(), retries=FLAGS.retries)
+    total = sum(num_rounds(t) * t.setting.config.train.num_steps for t in trials) - shown
+    events = jobs.run_jobs(trials, make_engine(), retries=FLAGS.retries)
     with contextlib.closing(events), runtime.track(total, f"{len(trials)} processes") as bar:
-        for kind, job, reason in events:
-            if job is not None:
-                states[job.name] = kind
+        for kind, trial, reason in events:
+            if trial is not None:
+                states[trial.name] = kind
                 if kind != "started":
-                    print(f"{job.name}: {kind}{': ' if reason else ''}{reason}", flush=True)
+                    print(f"{trial.name}: {kind}{': ' if reason else ''}{reason}", flush=True)
                 if kind in ("finished", "failed"):
-                    note_end(by_name[job.name], reason)
+                    note_end(trial, reason)
             count, now = Counter(states.values()), steps_done()
             numbers = {"running": count["started"], "finished": count["finished"]}
             bar.advance(now - shown, **numbers, failed=count["failed"])

@@ -1,12 +1,15 @@
 """Jobs of a sweep: in what order they run, where, and what is done about those that die.
 
-Nothing here knows what a job does.
+Nothing here knows what a job does. An engine's `start(job)` gives the handle of a job that runs, or
+None where there is no place for it now; `ended(handles)` gives those that have ended, with their
+exit status (-n: killed by signal n; None: the machine is gone); `stop(handles)` ends them.
 """
 
 from __future__ import annotations
 
 import collections
 import contextlib
+import dataclasses
 import os
 import pathlib
 import shlex
@@ -15,16 +18,17 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
-from experiments.runtime import ConfigError, one_line
+from experiments.runtime import ConfigError
 
 GPU_SHARE = 0.9  # of a GPU's memory that its jobs may take together
 PATIENCE = 5.0  # seconds from asking a process to end to making it
 
 
-class Job(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Job:
     """One process of the project's Python, to be run at most once to its end."""
 
     name: str
@@ -32,19 +36,6 @@ class Job(NamedTuple):
     log: pathlib.Path  # what it prints, all attempts one after another
     is_finished: Callable[[], bool]  # from its files
     needs: str | None = None  # another job that must be finished before
-
-
-class Engine(Protocol):
-    """Where jobs run."""
-
-    def start(self, job: Job) -> Any:
-        """Starts a job and returns its handle; None where there is no place for it now."""
-
-    def ended(self, handles: Iterable) -> list[tuple[Any, int | None]]:
-        """Those that have ended, with the exit status: -n: killed by signal n; None: it is gone."""
-
-    def stop(self, handles: Iterable) -> None:
-        """Ends jobs that still run."""
 
 
 class Event(NamedTuple):
@@ -55,9 +46,7 @@ class Event(NamedTuple):
     reason: str = ""  # why it is tried again or has failed
 
 
-def run_jobs(
-    jobs: list[Job], engine: Engine, *, retries: int, wait_seconds: float = 1.0
-) -> Iterator[Event]:
+def run_jobs(jobs: list[Job], engine, *, retries: int, wait_seconds=1.0) -> Iterator[Event]:
     """Runs jobs to their end and says what happens; closing the iterator stops what runs.
 
     A job that is finished already is not started. One that dies without having said why (it is
@@ -192,22 +181,28 @@ def make_slots(
 
 def usable_cores() -> list[int]:
     """The cores that this process may use, fewer where a container has less time than that."""
-    if hasattr(os, "sched_getaffinity"):
-        cores = sorted(os.sched_getaffinity(0))
-    else:
-        cores = list(range(os.cpu_count() or 1))
+    affinity = getattr(os, "sched_getaffinity", lambda pid: range(os.cpu_count() or 1))
+    cores = sorted(affinity(0))
     quota, _, period = _read("/sys/fs/cgroup/cpu.max").partition(" ")
     return cores[: max(1, int(quota) // int(period))] if quota.isdigit() and period else cores
 
 
 def free_memory_gb() -> float:
     """Memory of the host that new processes can have, in units of 10^9 bytes."""
-    free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    known = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
     for line in _read("/proc/meminfo").splitlines():
         if line.startswith("MemAvailable:"):
-            free = int(line.split()[1]) * 1024
+            known.append(int(line.split()[1]) * 1024)
     limits = [_read(f"/sys/fs/cgroup/{n}") for n in ("memory.max", "memory/memory.limit_in_bytes")]
-    return min([free, *(int(limit) for limit in limits if limit.isdigit())]) / 1e9
+    return min(known + [int(limit) for limit in limits if limit.isdigit()]) / 1e9
+
+
+def _read(path: str) -> str:
+    """A small file's text, empty where there is no such file: not every system has each."""
+    try:
+        return pathlib.Path(path).read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
 
 
 def visible_gpus() -> list[str]:
@@ -223,14 +218,6 @@ def visible_gpus() -> list[str]:
     query = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
     listed = subprocess.run(query, capture_output=True, text=True)
     return listed.stdout.split() if listed.returncode == 0 else []
-
-
-def _read(path: str) -> str:
-    """A small file's text, empty where there is no such file: not every system has each."""
-    try:
-        return pathlib.Path(path).read_text(encoding="ascii").strip()
-    except OSError:
-        return ""
 
 
 class LocalEngine:
@@ -250,12 +237,12 @@ class LocalEngine:
         self._used[process] = slot
         return process
 
-    def ended(self, handles):
+    def ended(self, handles) -> list[tuple]:
         done = [process for process in handles if process.poll() is not None]
         self._free += [self._used.pop(process) for process in done]
         return [(process, process.returncode) for process in done]
 
-    def stop(self, handles):
+    def stop(self, handles) -> None:
         for process in handles:
             process.terminate()
         for process in handles:
@@ -285,29 +272,32 @@ class RayEngine:
         except ConnectionError as error:
             raise ConfigError(f"--ray_address: {' '.join(str(error).split())}") from None
         gpus = 1 if ray.cluster_resources().get("GPU") else 0
-        resources = {"num_cpus": cores_per_trial, "num_gpus": gpus}
-        self._task = ray.remote(**resources, max_retries=0, max_calls=1)(_run_process)
+        place = {"num_cpus": cores_per_trial, "num_gpus": gpus, "max_retries": 0, "max_calls": 1}
+        self._task = ray.remote(**place)(_run_process)
         self._env = {"NPROC": str(cores_per_trial)}
+        self._logs: dict = {}  # by handle
 
     def start(self, job: Job):
-        return self._task.remote(job.argv, str(job.log.absolute()), self._env, os.getcwd())
+        ref = self._task.remote(job.argv, str(job.log.absolute()), self._env, os.getcwd())
+        self._logs[ref] = job.log
+        return ref
 
-    def ended(self, handles):
-        handles = list(handles)
-        done, _ = self._ray.wait(handles, num_returns=len(handles), timeout=0)
-        return [(ref, self._code(ref)) for ref in done]
+    def ended(self, handles) -> list[tuple]:
+        left = list(handles)
+        done = self._ray.wait(left, num_returns=len(left), timeout=0)[0] if left else []
+        return [(ref, self._exit_code(ref)) for ref in done]
 
-    def _code(self, ref) -> int | None:
+    def _exit_code(self, ref) -> int | None:
         try:
             return self._ray.get(ref)
-        except self._ray.exceptions.RayTaskError as error:
-            # The worker lives, but could not even start the process.
-            print(f"ray: {one_line(error)}", flush=True)
+        except self._ray.exceptions.RayTaskError as error:  # the worker could not start the job
+            with open(self._logs[ref], "a", encoding="utf-8") as file:
+                file.write(f"{error}\n")
             return 1
         except self._ray.exceptions.RayError:
             return None
 
-    def stop(self, handles):
+    def stop(self, handles) -> None:
         if left := list(handles):
             for ref in left:
                 self._ray.cancel(ref, force=True)

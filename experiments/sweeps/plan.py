@@ -28,12 +28,11 @@ FILE = "sweep.json"
 
 
 class Axes(NamedTuple):
-    """The values of every axis."""
+    """What a sweep varies: each policy with each seed in each setting of options."""
 
     policies: tuple[str, ...]
     seeds: tuple[int, ...]
-    options: tuple[tuple[dict[str, Any], ...], ...]  # of each axis, what each of its values sets
-    changes: tuple[dict[str, Any], ...] = ()  # made one at a time, beside no change
+    settings: list[dict[str, Any]]  # values by the option's name
 
 
 def parse_axes(texts: Sequence[str], config, changes: Sequence[str] = ()) -> Axes:
@@ -69,15 +68,22 @@ def parse_axes(texts: Sequence[str], config, changes: Sequence[str] = ()) -> Axe
             own[names[0]] = tuple(row[0] for row in rows)
         else:
             fields = [name.removeprefix("config.") for name in names]
-            (options if flag == "axis" else alone).append([dict(zip(fields, r)) for r in rows])
-    axes = Axes(own["policy"], own["seed"], tuple(map(tuple, options)), (*itertools.chain(*alone),))
-    counts = [len(axes.policies), len(axes.seeds), 1 + len(axes.changes), *map(len, options)]
+            values = [dict(zip(fields, row)) for row in rows]
+            if flag == "axis":
+                options.append(values)
+            else:
+                alone += values
+    policies, seeds = own["policy"], own["seed"]
+    counts = [len(policies), len(seeds), 1 + len(alone), *map(len, options)]
     if math.prod(counts) > MAX_TRIALS:
         raise ConfigError(
             f"--axis: {' x '.join(map(str, counts))} are {math.prod(counts):,} trials; "
             f"give axes of at most {MAX_TRIALS:,} in all"
         )
-    return axes
+    # Every combination, as it is and then with one change at a time.
+    rows = itertools.product(*options, [{}, *alone])
+    settings = [{name: v for part in row for name, v in part.items()} for row in rows]
+    return Axes(policies, seeds, settings)
 
 
 def _parse(text: str, known: dict[str, Any]) -> tuple[list[str], list[tuple]]:
@@ -103,7 +109,7 @@ def _parse(text: str, known: dict[str, Any]) -> tuple[list[str], list[tuple]]:
         parts = item.split("+") if len(names) > 1 else [item]
         if len(parts) != len(names):
             raise ConfigError(f"{item!r} is not {len(names)} values")
-        if type(known[name]) is int and re.fullmatch(r"-?\d{1,18}(:-?\d{1,18}){1,2}", item):
+        if type(known[names[0]]) is int and re.fullmatch(r"-?\d{1,18}(:-?\d{1,18}){1,2}", item):
             first, end, *step = map(int, item.split(":"))
             if step == [0]:
                 raise ConfigError(f"{item!r} has a step of 0")
@@ -159,18 +165,13 @@ class Setting(NamedTuple):
     parts: list[Part]
 
 
-class Trial(NamedTuple):
-    """One part of one setting, and the job that makes it."""
+@dataclasses.dataclass(frozen=True)
+class Trial(Job):
+    """The job that makes one part of one setting."""
 
+    _: dataclasses.KW_ONLY
     setting: Setting
     part: Part
-    job: Job
-
-
-def settings(axes: Axes) -> list[dict[str, Any]]:
-    """Every combination of the axes' values, as it is and then with one change at a time."""
-    rows = itertools.product(*axes.options, ({}, *axes.changes))
-    return [{name: v for part in row for name, v in part.items()} for row in rows]
 
 
 def setting_name(values: dict[str, Any]) -> str:
@@ -180,21 +181,17 @@ def setting_name(values: dict[str, Any]) -> str:
 
 
 def make_settings(config, axes: Axes, workdir: pathlib.Path) -> list[Setting]:
-    """The experiments that a sweep is made of.
-
-    Raises:
-      SelectionError: a policy that does not exist.
-      ConfigError: two settings whose folders would have the same name.
-    """
+    """The experiments that a sweep is made of; ConfigError if two would share a folder."""
     made: dict[str, Setting] = {}
-    for values in settings(axes):
+    parts = all_parts(axes.policies, axes.seeds)
+    has_changes = {} in axes.settings and len(axes.settings) > 1
+    for values in axes.settings:
         own = copy.deepcopy(config)
         own.policies, own.seeds = axes.policies, axes.seeds
         own.update_from_flattened_dict(values)
-        name = setting_name(values) if values or not axes.changes else UNCHANGED
+        name = UNCHANGED if has_changes and not values else setting_name(values)
         if name in made:
             raise ConfigError(f"--axis: two settings would share the folder {name}; drop one")
-        parts = all_parts(axes.policies, axes.seeds)
         made[name] = Setting(values, name, workdir / name, own, parts)
     return [*made.values()]
 
@@ -202,10 +199,7 @@ def make_settings(config, axes: Axes, workdir: pathlib.Path) -> list[Setting]:
 def make_trials(setting: Setting, config_flags: list[str], more: Sequence[str] = ()) -> list[Trial]:
     """A trial for each part that is not finished, and for the round 0 that such a part needs.
 
-    Args:
-      setting: the experiment.
-      config_flags: what the user gave of the config, as flags.
-      more: flags of the script that makes a part.
+    `config_flags` are what the user gave of the config, `more` other flags for each trial.
     """
     folder = setting.folder
     left = [part for part in setting.parts if not is_finished(folder, part)]
@@ -214,21 +208,22 @@ def make_trials(setting: Setting, config_flags: list[str], more: Sequence[str] =
     # A tuple that is given twice would be added up.
     kept = [f for f in config_flags if f.partition("=")[0].removeprefix("--config.") not in own]
     shared = (*SCRIPT, *kept, *(option_flag(name, value) for name, value in own.items()))
-    trials = []
-    for part in left:
-        if part.policy or part in wanted:
-            job = Job(
-                name=f"{folder / part.name}",
-                argv=(
-                    *(*shared, f"--workdir={folder}", f"--part={part.name}"),
-                    *("--end_with_stdin", *more),
-                ),
-                log=folder / part.name / "log.txt",
-                is_finished=partial(is_finished, folder, part),
-                needs=f"{folder / part.initial.name}" if part.policy else None,
-            )
-            trials.append(Trial(setting, part, job))
-    return trials
+    return [
+        Trial(
+            name=f"{folder / part.name}",
+            argv=(
+                *(*shared, f"--workdir={folder}", f"--part={part.name}"),
+                *("--end_with_stdin", *more),
+            ),
+            log=folder / part.name / "log.txt",
+            is_finished=partial(is_finished, folder, part),
+            needs=f"{folder / part.initial.name}" if part.policy else None,
+            setting=setting,
+            part=part,
+        )
+        for part in left
+        if part.policy or part in wanted
+    ]
 
 
 def option_flag(name: str, value) -> str:
@@ -259,11 +254,7 @@ class Record:
 
 
 def read_record(workdir: pathlib.Path) -> Record | None:
-    """The record of a sweep's folder; None where there is none.
-
-    Raises:
-      WorkdirError: the file is broken or of another version.
-    """
+    """The record of a sweep's folder, None without one; WorkdirError if it cannot be used."""
     path, fix = workdir / FILE, "delete it and run the sweep again"
     if not path.exists():
         return None
