@@ -25,11 +25,11 @@ from bavs_jax.selection.information import (
     make_cached_curvature_fn,
 )
 from bavs_jax.selection.policy import Policy
+from bavs_jax.uncertainty.channel import mean_uncertainty
 from bavs_jax.uncertainty.measures import TrueErrorFn
 from bavs_jax.uncertainty.model import Acquired, ModelFns, SceneSetup
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from bavs_jax.uncertainty.posterior import curvature_factor, posterior_precision, prior_precision
-from bavs_jax.uncertainty.scoring import mean_uncertainty
 from bavs_jax.uncertainty.streaming import CurvatureRays, rays_through_pixels
 
 WEIGHTING = "gauss_newton"  # of candidates: the only one that needs no photo

@@ -25,12 +25,12 @@ from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.training.fit import Trainer, is_stuck, single_colour_error
 from bavs_jax.training.train import TrainInfo, TrainState
+from bavs_jax.uncertainty.channel import make_render_chunk_fn
 from bavs_jax.uncertainty.measures import make_true_error_fn
 from bavs_jax.uncertainty.model import RECONSTRUCTION, LaplaceOptions, ModelFns, SceneSetup
 from bavs_jax.uncertainty.models import MODELS
 from bavs_jax.uncertainty.models.laplace import laplace_variance
 from bavs_jax.uncertainty.posterior import default_prior_weight
-from bavs_jax.uncertainty.scoring import make_render_chunk_fn
 from bavs_jax.uncertainty.streaming import CurvatureOfRays, curvature_group_size
 from experiments.build_model import (
     KINDS,
@@ -203,15 +203,12 @@ class Problem:
         self.grid = DeformationGrid(
             jnp.asarray(scene.box), uncertainty.log2_cells, contracted=scene.unbounded
         )
-        channel = ("variant", "scale", "extent")
         prior_weight = uncertainty.prior_weight or default_prior_weight(uncertainty.log2_cells)
         self.laplace = LaplaceOptions(
             prior_weight=prior_weight / float(offset_unit(scene.box)) ** 2,
             max_rays=uncertainty.max_rays or None,
-            **only(uncertainty, "weighting", "offset_cells", *channel),
+            **only(uncertainty, "weighting", "offset_cells", "variant", "scale", "extent"),
         )
-        look = only(uncertainty, *channel)
-        self._render_chunk = make_render_chunk_fn(self.model, self.grid, mesh=mesh, **look)
         self._density = jax.jit(self.model.density)
         self.lpips_fn, self.lpips_reason = None, "switched off: config.lpips_net is empty"
         if config.lpips_net:
@@ -250,7 +247,7 @@ class Problem:
         variance = None
         if jac_sq_sum is not None:
             variance = laplace_variance(jac_sq_sum, num_rays, self.laplace)
-        return partial(self._render_chunk, train.model, variance)
+        return partial(self.setup.render_chunk, train.model, variance)
 
     def density(self, train: TrainState, positions) -> jax.Array:
         """At points [K, 3]: [K] 1 / scene unit, 0 where nothing is rendered."""
@@ -264,6 +261,7 @@ class Problem:
         def train(kind, key, acquired):
             return train_aside(config, self.trainers[kind], key, acquired, kind, self.track)
 
+        channel = only(config.uncertainty, "variant", "scale", "extent")
         group_size = curvature_group_size(self.grid.num_vertices, len(self.table.cameras))
         return SceneSetup(
             models=self.models,
@@ -274,6 +272,7 @@ class Problem:
             curvature=CurvatureOfRays(
                 self.model, self.grid, group_size=group_size, track=self.track, mesh=self.mesh
             ),
+            render_chunk=make_render_chunk_fn(self.model, self.grid, mesh=self.mesh, **channel),
             train=train,
             image_scale=config.candidates.image_scale,
             chunk=RENDER_CHUNK,

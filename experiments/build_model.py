@@ -13,7 +13,9 @@ from jax.sharding import Mesh
 from bavs_jax.devices import num_shards, put_on_all
 from bavs_jax.fields import flow_field, hash_grid, nerf_mlp
 from bavs_jax.fields.base import Field
-from bavs_jax.fields.flow_field import FlowField
+from bavs_jax.fields.flow_field import FlowField, FlowOptions
+from bavs_jax.fields.hash_grid import HashGridOptions
+from bavs_jax.fields.nerf_mlp import NerfMlpOptions
 from bavs_jax.fields.positional import PIXEL_TO_RADIUS
 from bavs_jax.models import objectives
 from bavs_jax.models.ray_field import RayField, RayTraining
@@ -39,7 +41,6 @@ SAMPLERS = {
     "mip_mlp": ("proposal",),
 }
 LEARNING_RATES = {"hash_grid": 1e-2, "nerf_mlp": 1e-3, "mip_mlp": 1e-3}
-TRUNK = ("depth", "width", "skip", "position_degree", "direction_degree")  # of the networks
 
 
 def only(options, *names: str) -> dict:
@@ -75,25 +76,26 @@ def build_field(
         )
     options = {"contracted": contracted, "learned_variance": learned_variance}
     if kind == "hash_grid":
-        options |= {"num_views": num_views}
-        field = hash_grid.make_hash_grid_field(box, **config.hash_grid, **options)
-    elif kind == "nerf_mlp":
-        field = nerf_mlp.make_nerf_mlp_field(box, **config.nerf_mlp, **options)
+        grid = HashGridOptions(**config.hash_grid)
+        field = hash_grid.make_hash_grid_field(box, grid, num_views=num_views, **options)
     else:
-        options |= only(config.mip_mlp, *TRUNK) | {"pixel_radius": _pixel_radius(scene)}
-        field = nerf_mlp.make_nerf_mlp_field(box, **options)
+        options["pixel_radius"] = _pixel_radius(scene) if kind == "mip_mlp" else None
+        field = nerf_mlp.make_nerf_mlp_field(box, _mlp_options(config), **options)
     return field, _build_sampler(config, scene, sampler_kind)
+
+
+def _mlp_options(config) -> NerfMlpOptions:
+    names = (field.name for field in dataclasses.fields(NerfMlpOptions))
+    return NerfMlpOptions(**only(config[config.field_kind], *names))
 
 
 def build_flow(config, scene: Scene) -> FlowField:
     """The distribution over fields that goes with a config's kind of field."""
-    common = {"contracted": scene.unbounded, **config.flow}
+    flow, where = FlowOptions(**config.flow), {"contracted": scene.unbounded}
     if config.field_kind == "hash_grid":
-        aside = ("appearance_features", "initial_optical_depth")
-        grid = {k: v for k, v in config.hash_grid.items() if k not in aside}
-        return flow_field.make_flow_field(scene.box, **grid, **common)
-    trunk = only(config[config.field_kind], *TRUNK)
-    return flow_field.make_flow_mlp_field(scene.box, **trunk, **common)
+        grid = HashGridOptions(**config.hash_grid)
+        return flow_field.make_flow_field(scene.box, grid, flow, **where)
+    return flow_field.make_flow_mlp_field(scene.box, _mlp_options(config), flow, **where)
 
 
 def _pixel_radius(scene: Scene) -> float:
@@ -124,7 +126,7 @@ def _build_sampler(config, scene: Scene, kind: str) -> Sampler:
     else:
         interval_fn = partial(box_intervals, box=box, near=near, far=far)
     if kind == "coarse_to_fine":
-        coarse = nerf_mlp.make_nerf_mlp_field(box, contracted=scene.unbounded, **config.nerf_mlp)
+        coarse = nerf_mlp.make_nerf_mlp_field(box, _mlp_options(config), contracted=scene.unbounded)
         return make_coarse_to_fine_sampler(
             coarse, interval_fn, background=_background(scene), **config.coarse_to_fine
         )
@@ -145,9 +147,9 @@ def _build_sampler(config, scene: Scene, kind: str) -> Sampler:
         )
     else:
         shape = only(options, "num_levels", "coarsest", "log2_table_size", "width")
-        shape["contracted"] = scene.unbounded
-        make = partial(hash_grid.make_hash_grid_density, box, **shape)
-        densities = [make(finest=finest) for finest in options.finest]
+        grids = [HashGridOptions(finest=finest, **shape) for finest in options.finest]
+        make = partial(hash_grid.make_hash_grid_density, contracted=scene.unbounded)
+        densities = [make(box, grid) for grid in grids]
     weights = only(options, "interlevel_weight", "distortion_weight", "penalty_weight")
     counts = only(options, "num_proposals", "num_samples", "anneal_steps")
     return make_proposal_sampler(densities, interval_fn, **counts, **weights)

@@ -32,7 +32,7 @@ from bavs_jax.export.formats import ExportError
 from bavs_jax.placement.collect import PlacementError
 from bavs_jax.scenes import SceneError
 from bavs_jax.scenes.base import printable
-from bavs_jax.selection.context import SelectionError
+from bavs_jax.selection import SelectionError
 from experiments import handle_signals, stop
 
 PACKAGES = ("bavs_jax", "jax", "jaxlib", "flax", "optax", "numpy")

@@ -17,8 +17,12 @@ import optax
 from bavs_jax.cameras import take
 from bavs_jax.devices import make_mesh, num_shards, put_on_all
 from bavs_jax.fields.deformation import DeformationGrid
-from bavs_jax.fields.flow_field import make_flow_field, mean_field
-from bavs_jax.fields.hash_grid import make_hash_grid_density, make_hash_grid_field
+from bavs_jax.fields.flow_field import FlowOptions, make_flow_field, mean_field
+from bavs_jax.fields.hash_grid import (
+    HashGridOptions,
+    make_hash_grid_density,
+    make_hash_grid_field,
+)
 from bavs_jax.models.objectives import (
     make_colour_objective,
     make_flow_objective,
@@ -31,14 +35,13 @@ from bavs_jax.rendering.samplers import make_occupancy_sampler
 from bavs_jax.rendering.sampling import make_march_options
 from bavs_jax.rendering.spacing import box_intervals
 from bavs_jax.training.train import init_train_state, make_train_fn
-from bavs_jax.uncertainty.channel import vertex_variance
+from bavs_jax.uncertainty.channel import make_render_chunk_fn, mean_uncertainty, vertex_variance
 from bavs_jax.uncertainty.predictive import make_predictive_fn
-from bavs_jax.uncertainty.scoring import make_render_chunk_fn, mean_uncertainty
 from bavs_jax.uncertainty.streaming import make_curvature_fn, table_rays
 from tests.toy_scenes import toy_scene
 
 NUM_RAYS, CAPACITY, CHUNK = 64, 4096, 128
-HASH = {"num_levels": 2, "coarsest": 4, "finest": 8, "width": 8, "direction_degree": 1}
+HASH = HashGridOptions(num_levels=2, coarsest=4, finest=8, width=8, direction_degree=1)
 
 
 def gradient(model, mesh, table, mask):
@@ -65,10 +68,10 @@ def main(out):
     )
     sampler = make_occupancy_sampler(scene.box, march, resolution=8)
     shared = {"capacity": CAPACITY // shards, "mesh": mesh}
-    field = make_hash_grid_field(scene.box, **HASH)
-    with_variance = make_hash_grid_field(scene.box, **HASH, learned_variance=True)
-    flow = make_flow_field(scene.box, **HASH, num_flows=2, condition_features=8)
-    proposal = make_hash_grid_density(scene.box, num_levels=2, coarsest=4, finest=8, width=8)
+    field = make_hash_grid_field(scene.box, HASH)
+    with_variance = make_hash_grid_field(scene.box, HASH, learned_variance=True)
+    flow = make_flow_field(scene.box, HASH, FlowOptions(condition_features=8, num_flows=2))
+    proposal = make_hash_grid_density(scene.box, HASH)
     proposals = make_proposal_sampler(
         [proposal],
         partial(box_intervals, box=scene.box, near=scene.near, far=scene.far),

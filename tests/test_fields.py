@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bavs_jax.fields.encodings import interpolate_level, level_resolutions, spherical_harmonics
-from bavs_jax.fields.hash_grid import make_hash_grid_field
+from bavs_jax.fields.hash_grid import HashGridOptions, make_hash_grid_field
 from bavs_jax.numerics import density_from_raw, safe_divide, safe_reciprocal
 from tests.oracles_rendering import interpolate_level_loop
 
@@ -86,7 +86,7 @@ def test_spherical_harmonics_are_orthonormal():
 
 
 def test_field_gives_colours_densities_and_agrees_with_its_density():
-    field = make_hash_grid_field(BOX, num_levels=3, finest=32, log2_table_size=10)
+    field = make_hash_grid_field(BOX, HashGridOptions(num_levels=3, finest=32, log2_table_size=10))
     params = field.init(jax.random.key(0))
     x = jax.random.uniform(jax.random.key(1), (50, 3), minval=-3, maxval=4)
     d = jnp.tile(jnp.array([[0.0, 0.0, 1.0]]), (50, 1))
@@ -97,7 +97,7 @@ def test_field_gives_colours_densities_and_agrees_with_its_density():
 
 
 def test_density_does_not_depend_on_direction_but_colour_does():
-    field = make_hash_grid_field(BOX, num_levels=2, finest=32, log2_table_size=10)
+    field = make_hash_grid_field(BOX, HashGridOptions(num_levels=2, finest=32, log2_table_size=10))
     params = field.init(jax.random.key(0))
     x = jnp.zeros((1, 3))
     one = field.apply(params, x, jnp.array([[0.0, 0.0, 1.0]]))
@@ -107,7 +107,7 @@ def test_density_does_not_depend_on_direction_but_colour_does():
 
 
 def test_gradients_are_finite_far_outside_and_at_corners():
-    field = make_hash_grid_field(BOX, num_levels=2, finest=32, log2_table_size=10)
+    field = make_hash_grid_field(BOX, HashGridOptions(num_levels=2, finest=32, log2_table_size=10))
     params = field.init(jax.random.key(0))
     x = jnp.concatenate([jnp.asarray(BOX), jnp.array([[1e6, -1e6, 0.0]])])
     d = jnp.tile(jnp.array([[0.0, 1.0, 0.0]]), (3, 1))

@@ -9,7 +9,8 @@ import optax
 import pytest
 from scipy.stats import gaussian_kde
 
-from bavs_jax.fields.flow_field import base_draws, make_flow_field
+from bavs_jax.fields.flow_field import FlowOptions, base_draws, make_flow_field
+from bavs_jax.fields.hash_grid import HashGridOptions
 from bavs_jax.models.losses import (
     colour_likelihood_loss,
     flow_loss,
@@ -123,12 +124,8 @@ DIRECTIONS = jnp.array([[0.0, 0.0, 1.0]] * 2)
 NUM_DRAWS, FLOOR = 16, 0.003
 FIELD = make_flow_field(
     BOX,
-    num_levels=1,
-    finest=4,
-    width=16,
-    direction_degree=1,
-    condition_features=16,
-    num_flows=2,
+    HashGridOptions(num_levels=1, finest=4, width=16, direction_degree=1),
+    FlowOptions(condition_features=16, num_flows=2),
 )
 
 

@@ -1,5 +1,6 @@
 """Flows against autodiff and bisection; the field of flows as a distribution and as a field."""
 
+import dataclasses
 from functools import cache, partial
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from bavs_jax.fields.flow_field import (
+    FlowOptions,
     base_draws,
     make_flow_field,
     make_flow_mlp_field,
@@ -15,6 +17,8 @@ from bavs_jax.fields.flow_field import (
     unit_colour,
 )
 from bavs_jax.fields.flows import apply_flows, flow_from_raw, num_flow_parameters
+from bavs_jax.fields.hash_grid import HashGridOptions
+from bavs_jax.fields.nerf_mlp import NerfMlpOptions
 from tests.oracles_flows import invert_flows
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -42,13 +46,13 @@ def flows_of(seed, dim, *, scale=1.0, amplitude=2.0):
 
 
 # Two flows, so that both orders of the coordinates occur; each one more takes a second to compile.
-SMALL = {"condition_features": 8, "num_flows": 2}
+SMALL = FlowOptions(condition_features=8, num_flows=2)
 
 
-def small_field(**options):
-    return make_flow_field(
-        BOX, num_levels=1, finest=32, log2_table_size=10, width=16, **SMALL, **options
-    )
+def small_field(*, contracted=False, **options):
+    grid = HashGridOptions(num_levels=1, finest=32, log2_table_size=10, width=16)
+    flow = dataclasses.replace(SMALL, **options)
+    return make_flow_field(BOX, grid, flow, contracted=contracted)
 
 
 def some_points(num):
@@ -229,7 +233,7 @@ def test_fresh_field_is_thin_and_has_the_spread_of_its_base():
 def made(kind):
     """A field and parameters off their start, where all flows are near the identity."""
     if kind == "mlp":
-        field = make_flow_mlp_field(BOX, depth=6, width=16, **SMALL)
+        field = make_flow_mlp_field(BOX, NerfMlpOptions(depth=6, width=16), SMALL)
     else:
         field = small_field(contracted=kind == "contracted")
     shapes = jax.eval_shape(field.init, jax.random.key(0))
@@ -325,7 +329,9 @@ def test_base_draws_end_on_the_mean_when_asked():
 
 
 def test_paper_sized_network():
-    shapes = jax.eval_shape(make_flow_mlp_field(BOX).init, jax.random.key(0))
+    flow = FlowOptions(condition_features=64)
+    field = make_flow_mlp_field(BOX, NerfMlpOptions(width=512), flow)
+    shapes = jax.eval_shape(field.init, jax.random.key(0))
     widths = [shapes["trunk"][f"Dense_{i}"]["kernel"].shape for i in range(8)]
     assert widths == [(60, 512), *[(512, 512)] * 4, (572, 512), *[(512, 512)] * 2]
     flows = {name: shapes[name]["Dense_1"]["kernel"].shape for name in shapes if "flows" in name}

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bavs_jax.selection import SelectionError
 from bavs_jax.selection.batch import acquire
-from bavs_jax.selection.context import SelectionError, make_context
+from bavs_jax.selection.context import make_context
 from bavs_jax.selection.information import (
     MIN_ROWS,
     Information,

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bavs_jax.fields.hash_grid import make_hash_grid_field
+from bavs_jax.fields.hash_grid import HashGridOptions, make_hash_grid_field
 from bavs_jax.pixel_table import make_pixel_table
 from bavs_jax.rendering.samplers import dense_samples
 from experiments.build import Problem
@@ -90,11 +90,8 @@ def test_kinds_that_do_not_go_together_are_errors(unbounded, options, message):
 def test_views_without_training_are_read_with_the_mean_code():
     field = make_hash_grid_field(
         np.array([[-1.0] * 3, [1.0] * 3]),
-        num_levels=1,
-        finest=8,
-        width=8,
+        HashGridOptions(num_levels=1, finest=8, width=8, appearance_features=3),
         num_views=4,
-        appearance_features=3,
     )
     params = field.init(jax.random.key(0))
     assert not np.any(params["appearance"])

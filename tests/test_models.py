@@ -9,11 +9,11 @@ from bavs_jax.cameras import reduced_cameras, take
 from bavs_jax.models.losses import gaussian_nll
 from bavs_jax.pixel_table import view_pixel_rays
 from bavs_jax.policy_inputs import WEIGHTING, make_candidate_curvature_fn, training_looks
+from bavs_jax.uncertainty.channel import mean_uncertainty
 from bavs_jax.uncertainty.measures import make_true_error_fn
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired
 from bavs_jax.uncertainty.models import MODELS, get_model
 from bavs_jax.uncertainty.models.laplace import training_curvature
-from bavs_jax.uncertainty.scoring import mean_uncertainty
 from experiments.build import Problem, initial_views, load_config_scene
 from experiments.build_model import RENDER_CHUNK
 from tests.toy_rounds import silent

@@ -7,7 +7,7 @@ import pytest
 
 from bavs_jax.cameras import Rays
 from bavs_jax.fields.base import Field
-from bavs_jax.fields.nerf_mlp import make_mlp_density, make_nerf_mlp_field
+from bavs_jax.fields.nerf_mlp import NerfMlpOptions, make_mlp_density, make_nerf_mlp_field
 from bavs_jax.fields.positional import (
     cone_variance,
     frustum_variance,
@@ -76,9 +76,8 @@ def test_cone_variance_along_an_axis():
 
 @pytest.mark.parametrize("contracted, pixel_radius", [(False, None), (True, None), (False, 0.01)])
 def test_network_gives_colours_and_densities(contracted, pixel_radius):
-    field = make_nerf_mlp_field(
-        BOX, depth=6, width=16, contracted=contracted, pixel_radius=pixel_radius
-    )
+    options = NerfMlpOptions(depth=6, width=16)
+    field = make_nerf_mlp_field(BOX, options, contracted=contracted, pixel_radius=pixel_radius)
     params = field.init(jax.random.key(0))
     rays = rays_through(jax.random.key(1), 4)
     samples = dense_samples(jnp.full((4, 2), 2.0), jnp.full((4, 2), 0.5), jnp.zeros(4, bool))

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from bavs_jax.fields.deformation import DeformationGrid
-from bavs_jax.fields.hash_grid import make_hash_grid_density, make_hash_grid_field
+from bavs_jax.fields.hash_grid import (
+    HashGridOptions,
+    make_hash_grid_density,
+    make_hash_grid_field,
+)
 from bavs_jax.models.base import ModelState
 from bavs_jax.models.ray_field import RayField
 from bavs_jax.rendering.proposals import make_proposal_sampler
@@ -32,17 +36,13 @@ def setting(unbounded, codes):
     """A model with random parameters, and its state."""
     field = make_hash_grid_field(
         BOX,
-        num_levels=2,
-        coarsest=4,
-        finest=8,
-        width=8,
+        HashGridOptions(num_levels=2, coarsest=4, finest=8, width=8, appearance_features=codes),
         contracted=unbounded,
         num_views=NUM_VIEWS,
-        appearance_features=codes,
     )
     if unbounded:
         density = make_hash_grid_density(
-            BOX, num_levels=2, coarsest=4, finest=8, width=8, contracted=True
+            BOX, HashGridOptions(num_levels=2, coarsest=4, finest=8, width=8), contracted=True
         )
         interval_fn = partial(open_intervals, near=0.1, far=100.0, unit=1.0)
         sampler = make_proposal_sampler([density], interval_fn, num_proposals=(8,), num_samples=12)

@@ -6,8 +6,9 @@ import jax
 import numpy as np
 import pytest
 
+from bavs_jax.selection import SelectionError
 from bavs_jax.selection.batch import acquire, make_select_batch_fn, top_k
-from bavs_jax.selection.context import SelectionError, make_context
+from bavs_jax.selection.context import make_context
 from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import POLICIES
 from bavs_jax.selection.policy import Policy

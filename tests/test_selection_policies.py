@@ -7,9 +7,9 @@ import jax
 import numpy as np
 import pytest
 
-from bavs_jax.selection import policies
+from bavs_jax.selection import SelectionError, policies
 from bavs_jax.selection.batch import acquire
-from bavs_jax.selection.context import SelectionError, make_context
+from bavs_jax.selection.context import make_context
 from bavs_jax.selection.directional import DirectionalInformation, Look, make_precision_fn
 from bavs_jax.selection.distances import pairwise_distances
 from bavs_jax.selection.information import Information, make_cached_curvature_fn, sparse_curvature

@@ -10,7 +10,7 @@ import pytest
 
 from bavs_jax.cameras import project
 from bavs_jax.fields.deformation import DeformationGrid
-from bavs_jax.fields.hash_grid import make_hash_grid_field, table_roughness
+from bavs_jax.fields.hash_grid import HashGridOptions, make_hash_grid_field, table_roughness
 from bavs_jax.models.base import ModelState
 from bavs_jax.models.losses import colour_loss
 from bavs_jax.models.objectives import make_colour_objective
@@ -46,12 +46,14 @@ def trainer():
     scene = toy_scene()
     field = make_hash_grid_field(
         scene.box,
-        num_levels=2,
-        coarsest=8,
-        finest=16,
-        width=16,
-        direction_degree=1,
-        initial_optical_depth=2.0,  # a fog at first, which shows that something is learnt
+        HashGridOptions(
+            num_levels=2,
+            coarsest=8,
+            finest=16,
+            width=16,
+            direction_degree=1,
+            initial_optical_depth=2.0,  # a fog at first, which shows that something is learnt
+        ),
     )
     options = make_march_options(
         scene.box, near=scene.near, far=scene.far, num_steps=32, num_slots=24
@@ -417,7 +419,7 @@ def test_rays_that_were_not_looked_at_do_not_count_in_the_loss(trainer, looked_a
 def test_leaving_out_hidden_samples_trains_the_same_with_fewer_of_them(trainer):
     scene, model, *_ = trainer
     thick = make_hash_grid_field(
-        scene.box, num_levels=1, finest=8, width=16, initial_optical_depth=20.0
+        scene.box, HashGridOptions(num_levels=1, finest=8, width=16, initial_optical_depth=20.0)
     )
     table, mask = make_pixel_table(scene), jnp.ones(scene.num_views, bool)
     thick_model = make_model(scene, thick, model.sampler)

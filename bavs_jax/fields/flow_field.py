@@ -4,6 +4,7 @@ One draw from a Gaussian base, the same for all of space, is one radiance field:
 flows carry it to a density and a colour, and what is known about the point steers the flows.
 """
 
+import dataclasses
 from typing import NamedTuple, Protocol
 
 import flax.linen as nn
@@ -14,13 +15,27 @@ import numpy as np
 from bavs_jax.arrays import Array
 from bavs_jax.fields.base import Field, FieldDensity, InitParams, Params, ParamsTerm
 from bavs_jax.fields.contraction import unit_coordinates
-from bavs_jax.fields.encodings import HashEncoding, level_resolutions, spherical_harmonics
+from bavs_jax.fields.encodings import spherical_harmonics
 from bavs_jax.fields.flows import apply_flows, flow_from_raw, num_flow_parameters
-from bavs_jax.fields.hash_grid import table_penalty
-from bavs_jax.fields.nerf_mlp import Trunk, make_position_encoding
+from bavs_jax.fields.hash_grid import HashGridOptions, table_penalty
+from bavs_jax.fields.nerf_mlp import NerfMlpOptions, Trunk, make_position_encoding
 from bavs_jax.fields.positional import positional_encoding
 
 NOISE_DIM = 4  # one number for the density, three for the colour
+
+
+@dataclasses.dataclass(frozen=True)
+class FlowOptions:
+    """Size and shape of the flows."""
+
+    condition_features: int = 32  # units that steer each of the two stacks, 64 in the paper
+    num_flows: int = 4  # of each stack
+    # See `flow_from_raw`. The paper has 1, which holds every density within e^4 of a common one,
+    # and many colours away from black and white.
+    amplitude: float = 2.0
+    # See `positive_density`, 1 / scene unit; None: an optical depth of 1 over a 128th of the box's
+    # longest side.
+    density_scale: float | None = None
 
 
 class ApplyFlow(Protocol):
@@ -182,119 +197,81 @@ def _flow_field(module: FlowNetwork, encode, encode_directions, penalty) -> Flow
     return FlowField(init, apply, density, penalty)
 
 
-def _default_density_scale(box) -> float:
-    """1 / scene unit: an optical depth of 1 over a 128th of the box's longest side."""
-    return float(128.0 / np.max(box[1] - box[0]))
+def _flow_network(
+    box, trunk: nn.Module, geometry_features: int, colour_width: int, flow: FlowOptions
+) -> FlowNetwork:
+    density_scale = flow.density_scale
+    if density_scale is None:
+        density_scale = float(128.0 / np.max(box[1] - box[0]))
+    return FlowNetwork(
+        trunk=trunk,
+        geometry_features=geometry_features,
+        colour_width=colour_width,
+        condition_features=flow.condition_features,
+        num_flows=flow.num_flows,
+        amplitude=flow.amplitude,
+        density_scale=density_scale,
+    )
 
 
 class HashTrunk(nn.Module):
-    """A hash grid and one layer over it; attributes as in `HashGridField`."""
+    """A hash grid and one layer over it."""
 
-    resolutions: tuple[int, ...]
-    features: int
-    log2_table_size: int
-    width: int
+    options: HashGridOptions
 
     @nn.compact
     def __call__(self, unit_positions):
-        encoding = HashEncoding(
-            self.resolutions, self.features, self.log2_table_size, name="encoding"
-        )
-        return nn.relu(nn.Dense(self.width)(encoding(unit_positions)))
+        encoded = self.options.encoding("encoding")(unit_positions)
+        return nn.relu(nn.Dense(self.options.width)(encoded))
 
 
 def make_flow_field(
     box,
+    grid: HashGridOptions,
+    flow: FlowOptions,
     *,
-    num_levels: int = 8,
-    coarsest: int = 16,
-    finest: int = 128,
-    features: int = 2,
-    log2_table_size: int = 16,
-    width: int = 64,
-    geometry_features: int = 15,
-    direction_degree: int = 4,
-    condition_features: int = 32,
-    num_flows: int = 4,
-    amplitude: float = 2.0,
-    density_scale: float | None = None,
     contracted: bool = False,
 ) -> FlowField:
     """Makes CF-NeRF on a hash grid, for two cores.
 
     Args:
       box: [2, 3] lower and upper corner, scene units.
-      num_levels, coarsest, finest, features, log2_table_size: of the grid, as in
-        `make_hash_grid_field`.
-      width: units of the hidden layers.
-      geometry_features: features handed from the density to the colour network.
-      direction_degree: spherical-harmonics bands, 1 (no view dependence) to 4.
-      condition_features: units that steer each of the two stacks of flows, 64 in the paper.
-      num_flows: flows of each stack.
-      amplitude: see `flow_from_raw`. The paper has 1, which holds every density within e^4 of a
-        common one, and many colours away from black and white.
-      density_scale: see `positive_density`; by default 128 per longest side of the box.
+      grid: of the network that steers the flows; without its codes and its initial depth.
+      flow: of the distribution.
       contracted: see `unit_coordinates`.
     """
     box = np.asarray(box, np.float32)
-    trunk = HashTrunk(
-        level_resolutions(num_levels, coarsest, finest), features, log2_table_size, width
-    )
-    module = FlowNetwork(
-        trunk=trunk,
-        geometry_features=geometry_features,
-        colour_width=width,
-        condition_features=condition_features,
-        num_flows=num_flows,
-        amplitude=amplitude,
-        density_scale=density_scale or _default_density_scale(box),
-    )
     return _flow_field(
-        module,
+        _flow_network(box, HashTrunk(grid), grid.geometry_features, grid.width, flow),
         lambda positions: unit_coordinates(box, positions, contracted=contracted),
-        lambda directions: spherical_harmonics(directions, direction_degree),
+        lambda directions: spherical_harmonics(directions, grid.direction_degree),
         lambda params: table_penalty(params["trunk"]["encoding"]),
     )
 
 
 def make_flow_mlp_field(
     box,
+    mlp: NerfMlpOptions,
+    flow: FlowOptions,
     *,
-    depth: int = 8,
-    width: int = 512,
-    skip: int = 5,
-    position_degree: int = 10,
-    direction_degree: int = 4,
-    condition_features: int = 64,
-    num_flows: int = 4,
-    amplitude: float = 2.0,
-    density_scale: float | None = None,
     contracted: bool = False,
 ) -> FlowField:
-    """Makes CF-NeRF at the paper's size: a deep network over encoded positions.
+    """Makes CF-NeRF as in the paper: a deep network over encoded positions.
 
     Args:
       box: [2, 3] lower and upper corner, scene units.
-      depth, width, skip, position_degree, direction_degree: as in `make_nerf_mlp_field`.
-      condition_features, num_flows, amplitude, density_scale: as in `make_flow_field`.
+      mlp: of the network that steers the flows, 8 x 512 in the paper.
+      flow: of the distribution.
       contracted: see `unit_coordinates`.
     """
     box = np.asarray(box, np.float32)
     encode, _ = make_position_encoding(
-        box, degree=position_degree, contracted=contracted, pixel_radius=None
+        box, degree=mlp.position_degree, contracted=contracted, pixel_radius=None
     )
-    module = FlowNetwork(
-        trunk=Trunk(depth, width, skip),
-        geometry_features=width,
-        colour_width=width // 2,
-        condition_features=condition_features,
-        num_flows=num_flows,
-        amplitude=amplitude,
-        density_scale=density_scale or _default_density_scale(box),
-    )
+    trunk = Trunk(mlp.depth, mlp.width, mlp.skip)
     return _flow_field(
-        module,
+        _flow_network(box, trunk, mlp.width, mlp.width // 2, flow),
         encode,
-        lambda directions: positional_encoding(directions, direction_degree),
+        lambda directions: positional_encoding(directions, mlp.direction_degree),
         lambda params: 0.0,
     )

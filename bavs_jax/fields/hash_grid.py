@@ -1,5 +1,6 @@
 """A small, quick radiance field: a hash grid and two thin networks (Eq 1), and its proposals."""
 
+import dataclasses
 import functools
 import math
 import operator
@@ -14,37 +15,61 @@ from bavs_jax.fields.encodings import HashEncoding, level_resolutions, spherical
 from bavs_jax.numerics import density_from_raw, point_variance
 
 
+@dataclasses.dataclass(frozen=True)
+class HashGridOptions:
+    """Size and shape of a field on a hash grid."""
+
+    num_levels: int = 8
+    coarsest: int = 16  # cells per side of the coarsest level
+    finest: int = 128
+    features: int = 2  # per vertex
+    log2_table_size: int = 16  # the largest table of a level has 2^log2_table_size rows
+    width: int = 64  # units of each hidden layer
+    geometry_features: int = 15  # handed from the density to the colour network
+    direction_degree: int = 4  # spherical-harmonics bands, 1 (no view dependence) to 4
+    # Of the code that each view trained on has for its exposure and white balance; 0 for none.
+    # Views that are not trained on are read with the mean code.
+    appearance_features: int = 0
+    # Density times the box's side before training. A thick fog would hide from each ray what lies
+    # behind, and fill every sample there is room for.
+    initial_optical_depth: float = 0.3
+
+    @property
+    def resolutions(self) -> tuple[int, ...]:
+        """Cells per side of each level."""
+        return level_resolutions(self.num_levels, self.coarsest, self.finest)
+
+    def encoding(self, name: str | None = None) -> HashEncoding:
+        """The grid itself, as a module."""
+        return HashEncoding(self.resolutions, self.features, self.log2_table_size, name=name)
+
+
 class HashGridField(nn.Module):
     """Density from position, colour from the same features and the view direction.
 
     Attributes:
-      resolutions, features, log2_table_size: see `HashEncoding`.
+      options: size and shape.
       log_density: of the field before it is trained, 1 / scene unit.
-      The others are those of `make_hash_grid_field`.
+      num_views, learned_variance: see `make_hash_grid_field`.
     """
 
-    resolutions: tuple[int, ...]
-    features: int
-    log2_table_size: int
-    width: int
-    geometry_features: int
-    direction_degree: int
-    num_views: int = 0
-    appearance_features: int = 0
-    learned_variance: bool = False
+    options: HashGridOptions
     log_density: float = 0.0
+    num_views: int = 0
+    learned_variance: bool = False
 
     def setup(self):
-        self.encoding = HashEncoding(self.resolutions, self.features, self.log2_table_size)
-        self.density_hidden = nn.Dense(self.width)
-        self.density_out = nn.Dense(1 + self.geometry_features)
-        self.colour_hidden = [nn.Dense(self.width) for _ in range(2)]
+        options = self.options
+        self.encoding = options.encoding()
+        self.density_hidden = nn.Dense(options.width)
+        self.density_out = nn.Dense(1 + options.geometry_features)
+        self.colour_hidden = [nn.Dense(options.width) for _ in range(2)]
         self.colour_out = nn.Dense(3)
         if self.learned_variance:
             self.variance_out = nn.Dense(1)
-        if self.appearance_features:
+        if options.appearance_features:
             # 0 to begin with, and for good where a view is never trained on.
-            shape = (self.num_views, self.appearance_features)
+            shape = (self.num_views, options.appearance_features)
             self.appearance = self.param("appearance", nn.initializers.zeros, shape)
 
     def geometry(self, unit_positions):
@@ -58,12 +83,12 @@ class HashGridField(nn.Module):
             return self.appearance[view_ids]
         num_trained = jnp.maximum((self.appearance != 0).any(-1).sum(), 1)
         mean = self.appearance.sum(0) / num_trained
-        return jnp.broadcast_to(mean, (num, self.appearance_features))
+        return jnp.broadcast_to(mean, (num, self.options.appearance_features))
 
     def __call__(self, unit_positions, directions, view_ids=None):
         density, features = self.geometry(unit_positions)
-        parts = [features, spherical_harmonics(directions, self.direction_degree)]
-        if self.appearance_features:
+        parts = [features, spherical_harmonics(directions, self.options.direction_degree)]
+        if self.options.appearance_features:
             parts.append(self.codes(len(directions), view_ids))
         hidden = jnp.concatenate(parts, axis=-1)
         for layer in self.colour_hidden:
@@ -78,52 +103,28 @@ class HashGridField(nn.Module):
 
 def make_hash_grid_field(
     box,
+    options: HashGridOptions = HashGridOptions(),
     *,
-    num_levels: int = 8,
-    coarsest: int = 16,
-    finest: int = 128,
-    features: int = 2,
-    log2_table_size: int = 16,
-    width: int = 64,
-    geometry_features: int = 15,
-    direction_degree: int = 4,
     contracted: bool = False,
     num_views: int = 0,
-    appearance_features: int = 0,
     learned_variance: bool = False,
-    initial_optical_depth: float = 0.3,
 ) -> Field:
     """Makes a hash-grid field over a box, or over contracted space around it.
 
     Args:
       box: [2, 3] lower and upper corner, scene units.
-      num_levels, coarsest, finest: levels of the grid and their cells per side.
-      features: features per vertex.
-      log2_table_size: largest table of a level is `2^log2_table_size` rows.
-      width: units of each hidden layer.
-      geometry_features: features handed from the density to the colour network.
-      direction_degree: spherical-harmonics bands, 1 (no view dependence) to 4.
+      options: size and shape.
       contracted: see `unit_coordinates`.
       num_views: views of the scene; needed with appearance codes.
-      appearance_features: of the code that each view trained on has for its exposure and white
-        balance; 0 for none. Views that are not trained on are read with the mean code.
       learned_variance: `apply` also returns `{"beta": [K]}`, `softplus(.) + 0.01`, the variance of
         a point's colour (ActiveNeRF); trained by `make_variance_objective`.
-      initial_optical_depth: density times the box's side before training. A thick fog would hide
-        from each ray what lies behind, and fill every sample there is room for.
     """
     box = jnp.asarray(box, jnp.float32)
     module = HashGridField(
-        resolutions=level_resolutions(num_levels, coarsest, finest),
-        features=features,
-        log2_table_size=log2_table_size,
-        width=width,
-        geometry_features=geometry_features,
-        direction_degree=direction_degree,
+        options,
+        log_density=math.log(options.initial_optical_depth / float((box[1] - box[0]).mean())),
         num_views=num_views,
-        appearance_features=appearance_features,
         learned_variance=learned_variance,
-        log_density=math.log(initial_optical_depth / float((box[1] - box[0]).mean())),
     )
 
     def to_unit(positions):
@@ -150,7 +151,7 @@ def make_hash_grid_field(
     def penalty(params):
         return table_penalty(params["encoding"])
 
-    has_codes = appearance_features > 0
+    has_codes = options.appearance_features > 0
     return Field(
         init,
         apply,
@@ -158,7 +159,7 @@ def make_hash_grid_field(
         penalty,
         inputs if has_codes else no_inputs,
         reads_views=has_codes,
-        roughness=lambda params: table_roughness(params["encoding"], module.resolutions),
+        roughness=lambda params: table_roughness(params["encoding"], options.resolutions),
     )
 
 
@@ -191,37 +192,23 @@ def table_roughness(tables: dict, resolutions: tuple[int, ...]) -> jax.Array:
 
 
 class HashGridDensity(nn.Module):
-    """Density alone, from a hash grid and one thin layer; attributes as in `HashGridField`."""
+    """Density alone, by one hidden layer over the grid."""
 
-    resolutions: tuple[int, ...]
-    features: int
-    log2_table_size: int
-    width: int
+    options: HashGridOptions
 
     @nn.compact
     def __call__(self, unit_positions):
-        encoding = HashEncoding(
-            self.resolutions, self.features, self.log2_table_size, name="encoding"
-        )
-        hidden = nn.relu(nn.Dense(self.width)(encoding(unit_positions)))
+        encoded = self.options.encoding("encoding")(unit_positions)
+        hidden = nn.relu(nn.Dense(self.options.width)(encoded))
         return density_from_raw(nn.Dense(1)(hidden)[:, 0])
 
 
 def make_hash_grid_density(
-    box,
-    *,
-    num_levels: int = 4,
-    coarsest: int = 16,
-    finest: int = 128,
-    features: int = 2,
-    log2_table_size: int = 14,
-    width: int = 16,
-    contracted: bool = False,
+    box, options: HashGridOptions, *, contracted: bool = False
 ) -> DensityField:
-    """Makes a proposal; the arguments are those of `make_hash_grid_field`."""
+    """Makes a proposal of a grid and one hidden layer; see `make_hash_grid_field`."""
     box = jnp.asarray(box, jnp.float32)
-    resolutions = level_resolutions(num_levels, coarsest, finest)
-    module = HashGridDensity(resolutions, features, log2_table_size, width)
+    module = HashGridDensity(options)
 
     def density(params, positions):
         unit = unit_coordinates(box, positions, contracted=contracted)

@@ -4,6 +4,7 @@ With `pixel_radius` it reads the mean encoding over the piece of a pixel's cone 
 for, as in Mip-NeRF.
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import flax.linen as nn
@@ -14,6 +15,17 @@ from bavs_jax.fields.base import DensityField, Field, InputsFn, no_inputs
 from bavs_jax.fields.contraction import unit_coordinates
 from bavs_jax.fields.positional import cone_variance, integrated_encoding, positional_encoding
 from bavs_jax.numerics import point_variance
+
+
+@dataclasses.dataclass(frozen=True)
+class NerfMlpOptions:
+    """Size and shape of a NeRF network; those of the paper by default."""
+
+    depth: int = 8
+    width: int = 256
+    skip: int = 5  # hidden layers before the encoding comes in again
+    position_degree: int = 10  # octaves of the encodings
+    direction_degree: int = 4
 
 
 class Trunk(nn.Module):
@@ -49,16 +61,15 @@ def raw_to_density(raw: jax.Array) -> jax.Array:
 class NerfMlp(nn.Module):
     """Density from the trunk; colour from its features and the encoded direction."""
 
-    depth: int
-    width: int
-    skip: int
+    options: NerfMlpOptions
     learned_variance: bool = False
 
     def setup(self):
-        self.trunk = Trunk(self.depth, self.width, self.skip)
+        options = self.options
+        self.trunk = Trunk(options.depth, options.width, options.skip)
         self.density_out = nn.Dense(1)
-        self.features = nn.Dense(self.width)
-        self.colour_hidden = nn.Dense(self.width // 2)
+        self.features = nn.Dense(options.width)
+        self.colour_hidden = nn.Dense(options.width // 2)
         self.colour_out = nn.Dense(3)
         if self.learned_variance:
             self.variance_out = nn.Dense(1)
@@ -126,12 +137,8 @@ def make_position_encoding(
 
 def make_nerf_mlp_field(
     box,
+    options: NerfMlpOptions = NerfMlpOptions(),
     *,
-    depth: int = 8,
-    width: int = 256,
-    skip: int = 5,
-    position_degree: int = 10,
-    direction_degree: int = 4,
     contracted: bool = False,
     pixel_radius: float | None = None,
     learned_variance: bool = False,
@@ -140,26 +147,26 @@ def make_nerf_mlp_field(
 
     Args:
       box: [2, 3] lower and upper corner, scene units.
-      depth, width, skip: see `Trunk`; 8 x 256 with the encoding again after layer 5 in the paper.
-      position_degree, direction_degree: octaves of the encodings, 10 and 4 in the paper.
+      options: size and shape.
       contracted: see `unit_coordinates`.
       pixel_radius: of a pixel's cone at distance 1, for the integrated encoding; None for points.
       learned_variance: see `make_hash_grid_field`.
     """
     encode, inputs = make_position_encoding(
-        box, degree=position_degree, contracted=contracted, pixel_radius=pixel_radius
+        box, degree=options.position_degree, contracted=contracted, pixel_radius=pixel_radius
     )
-    module = NerfMlp(depth, width, skip, learned_variance)
+    module = NerfMlp(options, learned_variance)
+
+    def encode_directions(directions):
+        return positional_encoding(directions, options.direction_degree)
 
     def init(key):
         point, direction = jnp.zeros((1, 3)), jnp.array([[0.0, 0.0, 1.0]])
-        return module.init(key, encode(point), positional_encoding(direction, direction_degree))[
-            "params"
-        ]
+        return module.init(key, encode(point), encode_directions(direction))["params"]
 
     def apply(params, positions, directions, variance=None):
-        encoded_directions = positional_encoding(directions, direction_degree)
-        return module.apply({"params": params}, encode(positions, variance), encoded_directions)
+        encoded = encode(positions, variance), encode_directions(directions)
+        return module.apply({"params": params}, *encoded)
 
     def density(params, positions, variance=None):
         encoded = encode(positions, variance)
@@ -177,7 +184,7 @@ def make_mlp_density(
     contracted: bool = False,
     pixel_radius: float | None = None,
 ) -> DensityField:
-    """Makes a proposal network; the arguments are those of `make_nerf_mlp_field`."""
+    """Makes a proposal network; see `NerfMlpOptions` and `make_nerf_mlp_field`."""
     encode, inputs = make_position_encoding(
         box, degree=position_degree, contracted=contracted, pixel_radius=pixel_radius
     )

@@ -3,3 +3,7 @@
 `acquire` (`batch.py`) is the way in; `context.py` says what a policy may look at, and a new policy
 is one new file in `policies/`.
 """
+
+
+class SelectionError(ValueError):
+    """A selection that cannot be made: one line that names the cause and the fix."""

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.arrays import Array
-from bavs_jax.selection.context import Context, SelectionError, mark_picked
+from bavs_jax.selection import SelectionError
+from bavs_jax.selection.context import Context, mark_picked
 from bavs_jax.selection.distances import (
     FilterInfo,
     Radii,

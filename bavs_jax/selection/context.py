@@ -1,22 +1,15 @@
 """What a policy may look at when it scores candidates."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Literal, Protocol, overload
+from typing import Literal, Protocol, overload
 
 import numpy as np
 from flax import struct
 
 from bavs_jax.arrays import Array
-
-if TYPE_CHECKING:  # both import this module
-    from bavs_jax.selection.directional import DirectionalInformation
-    from bavs_jax.selection.information import Information
-
-
-class SelectionError(ValueError):
-    """A selection that cannot be made: one line that names the cause and the fix."""
+from bavs_jax.selection import SelectionError
+from bavs_jax.selection.directional import DirectionalInformation
+from bavs_jax.selection.information import Information
 
 
 class SourceFn(Protocol):

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.arrays import Array, Indices
-from bavs_jax.selection.context import SelectionError
+from bavs_jax.selection import SelectionError
 
 MIN_ROWS = 1024  # smallest padded size, so that views which see little share one compilation
 DEFAULT_MAX_BYTES = 2**30

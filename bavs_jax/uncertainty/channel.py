@@ -1,12 +1,22 @@
-"""Uncertainty as one more volume-rendered channel (Fig 4)."""
+"""Uncertainty as one more volume-rendered channel (Fig 4), whose mean is a view's score (Eq 15)."""
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
 
+from bavs_jax.arrays import Array
+from bavs_jax.cameras import Cameras, Rays
+from bavs_jax.devices import jit_over_rays
 from bavs_jax.fields.contraction import in_box, unit_coordinates
 from bavs_jax.fields.deformation import DeformationGrid, interpolate, offset_unit
+from bavs_jax.models.base import ModelState, RadianceModel
+from bavs_jax.progress import Progress
 from bavs_jax.registry import check_known
-from bavs_jax.rendering.render import Channel
+from bavs_jax.rendering.images import RenderChunk, render_views
+from bavs_jax.rendering.render import Channel, basic_images
 from bavs_jax.uncertainty.posterior import (
     bayesrays_vertex_variance,
     laplace_variance,
@@ -17,6 +27,9 @@ VARIANTS = ("posterior", "bayesrays")
 EXTENTS = ("box", "space")
 SCALES = ("log", "sigma")
 LOG10_MIN, LOG10_MAX = -3.0, 6.0
+
+# See `make_render_chunk_fn`.
+RenderChunkFn = Callable[[ModelState, Array | None, Rays], dict[str, jax.Array]]
 
 
 def vertex_variance(
@@ -96,3 +109,63 @@ def finish_uncertainty(rendered: jax.Array, *, scale: str) -> jax.Array:
     if scale == "sigma":
         return rendered
     return (jnp.clip(rendered, LOG10_MIN, LOG10_MAX) - LOG10_MIN) / (LOG10_MAX - LOG10_MIN)
+
+
+def make_render_chunk_fn(
+    model: RadianceModel,
+    grid: DeformationGrid,
+    *,
+    variant: str,
+    scale: str,
+    extent: str = "box",
+    mesh: Mesh | None = None,
+) -> RenderChunkFn:
+    """Makes the compiled rendering of a chunk of rays, uncertainty included (Fig 4).
+
+    The devices of a `mesh` (see `devices.py`) share the rays.
+
+    Returns:
+      `render_chunk(state, variance [G], rays)`, which gives of R rays the `basic_images` and
+      "uncertainty" [R]; without the last where the variance is None.
+    """
+
+    def render_chunk(state, variance, rays):
+        channels = {}
+        if variance is not None:
+            channels["uncertainty"] = make_uncertainty_channel(
+                grid, variance, variant=variant, scale=scale, extent=extent
+            )
+        rendering = model.render(state, rays, channels=channels)
+        images = basic_images(rendering)
+        for name, value in rendering.channels.items():
+            images[name] = finish_uncertainty(value, scale=scale)
+        return images
+
+    return jit_over_rays(render_chunk, mesh, sharded=(False, False, True))
+
+
+def mean_uncertainty(
+    chunk_fn: RenderChunk,
+    cameras: Cameras,
+    *,
+    chunk: int,
+    measure: str = "uncertainty",
+    progress_fn: Progress | None = None,
+) -> np.ndarray:
+    """Score [n] of candidates, `f = |U|_1 / (W H)` over the pixels of each one's image (Eq 15).
+
+    Args:
+      chunk_fn: renders `measure` of `chunk` rays, >= 0.
+      cameras: n candidates, mostly of a reduced size (`reduced_cameras`).
+      chunk: rays of one compiled call.
+      measure: which image's mean is taken.
+      progress_fn: called with the number of rays done since the last call.
+    """
+    images = render_views(
+        lambda rays: {measure: chunk_fn(rays)[measure]},
+        cameras,
+        np.arange(len(cameras)),
+        chunk=chunk,
+        progress_fn=progress_fn,
+    )
+    return np.array([image[measure].mean() for image in images], np.float32)

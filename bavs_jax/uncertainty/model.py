@@ -15,6 +15,7 @@ from bavs_jax.fields.flow_field import FlowField
 from bavs_jax.models.base import RadianceModel
 from bavs_jax.pixel_table import PixelTable
 from bavs_jax.training.train import TrainState
+from bavs_jax.uncertainty.channel import RenderChunkFn
 from bavs_jax.uncertainty.streaming import CurvatureOfRays
 
 Fitted = Any  # a pytree, each model's own
@@ -92,6 +93,7 @@ class SceneSetup(NamedTuple):
     grid: DeformationGrid
     laplace: LaplaceOptions
     curvature: CurvatureOfRays  # of the model of this kind
+    render_chunk: RenderChunkFn  # of the model of this kind, with its uncertainty
     # Trains a field of any kind, from a start of its own, on the views of a acquired.
     train: Callable[[str, jax.Array, Acquired], TrainState]
     image_scale: float = 0.25  # of width and height, for renders of whole views

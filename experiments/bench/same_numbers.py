@@ -14,8 +14,8 @@ from bavs_jax.cameras import take
 from bavs_jax.pixel_table import training_pixels, view_mask
 from bavs_jax.rendering.images import render_views
 from bavs_jax.scenes import Scene
+from bavs_jax.uncertainty.channel import mean_uncertainty
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE
-from bavs_jax.uncertainty.scoring import mean_uncertainty
 from bavs_jax.uncertainty.streaming import table_rays
 from experiments import runtime
 from experiments.build import Problem, initial_views, load_config_scene, run_key, stream_key

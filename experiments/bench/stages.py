@@ -18,7 +18,7 @@ from bavs_jax.selection.context import make_context
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.training.fit import Trainer
 from bavs_jax.training.train import TrainState
-from bavs_jax.uncertainty.scoring import mean_uncertainty
+from bavs_jax.uncertainty.channel import mean_uncertainty
 from bavs_jax.uncertainty.streaming import table_rays
 from experiments.bench.subject import (
     SEED,

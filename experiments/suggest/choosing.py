@@ -32,10 +32,10 @@ from bavs_jax.selection.worth import Worth, worth_along
 from bavs_jax.training.checkpoints import Checkpoints
 from bavs_jax.training.fit import fit
 from bavs_jax.training.train import TrainState
+from bavs_jax.uncertainty.channel import mean_uncertainty
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
-from bavs_jax.uncertainty.scoring import mean_uncertainty
 from experiments.build import Problem, run_key, stream_key
 from experiments.build_model import RENDER_CHUNK
 from experiments.configs import capture

@@ -7,7 +7,7 @@ sweep, the report and the battery of tests then know it.
 import difflib
 
 from bavs_jax.registry import collect
-from bavs_jax.selection.context import SelectionError
+from bavs_jax.selection import SelectionError
 from bavs_jax.selection.policy import Policy
 
 

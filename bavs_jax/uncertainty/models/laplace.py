@@ -16,7 +16,6 @@ from bavs_jax.uncertainty.model import (
 )
 from bavs_jax.uncertainty.posterior import offset_variance
 from bavs_jax.uncertainty.predictive import make_predictive_fn
-from bavs_jax.uncertainty.scoring import make_render_chunk_fn
 from bavs_jax.uncertainty.streaming import table_rays
 
 
@@ -51,14 +50,6 @@ def laplace_variance(jac_sq_sum: jax.Array, num_rays, options: LaplaceOptions) -
 def make_fns(setup: SceneSetup) -> ModelFns:
     """The variance of each vertex is what is fitted; it is rendered as a channel."""
     options = setup.laplace
-    render_chunk = make_render_chunk_fn(
-        setup.model,
-        setup.grid,
-        variant=options.variant,
-        scale=options.scale,
-        extent=options.extent,
-        mesh=setup.mesh,
-    )
 
     def fit(key, acquired):
         jac_sq_sum = training_curvature(key, setup, acquired, options.weighting)
@@ -66,7 +57,7 @@ def make_fns(setup: SceneSetup) -> ModelFns:
         return jax.block_until_ready(jnp.asarray(variance))
 
     def render(fitted, train, rays):
-        return render_chunk(train.model, fitted, rays)
+        return setup.render_chunk(train.model, fitted, rays)
 
     return ModelFns(fit, render)
 
