@@ -13,12 +13,12 @@ from absl import flags
 from ml_collections import config_flags
 
 from bavs_jax.selection.policies import POLICIES
-from experiments import job, runner, runtime
+from experiments import runner, runtime
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS
 runtime.define_cache_flags()
-flags.adopt_module_key_flags(job)
+runtime.define_device_flags()
 config_flags.DEFINE_config_file(
     "config",
     None,
@@ -44,11 +44,8 @@ def main() -> None:
     runtime.start_cache()
     if FLAGS.end_with_stdin:
         runtime.end_with_parent()
-    mesh = job.start_job()
-    if FLAGS.part is not None:
-        runner.make_parts(config, folder, runtime.command_line(), only=FLAGS.part, mesh=mesh)
-    else:
-        runner.run_all(config, folder, runtime.command_line(), mesh)
+    mesh = runtime.start_devices()
+    runner.run_all(config, folder, runtime.command_line(), mesh, only=FLAGS.part)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from ml_collections import config_flags
 from experiments import runtime
 from experiments.bench import stages
 from experiments.bench.results import BENCHMARK, benchmark_tables, write_result_page
-from experiments.build_scene import load_config_scene
+from experiments.build import load_config_scene
 from experiments.configs import base
 from experiments.files import write_json
 from experiments.reporting.tables import collected_text

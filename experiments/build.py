@@ -1,27 +1,26 @@
-"""From a config to the parts of a run. With `build_*` beside it, the only reader of configs."""
+"""From a config to a scene, its first views and candidates, and all that a run needs of it."""
 
 from __future__ import annotations
 
-import dataclasses
+import os
 from collections.abc import Callable
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from ml_collections import ConfigDict
 
 from bavs_jax.active import Acquisition, ActiveState
-from bavs_jax.candidates import CandidateSource
+from bavs_jax.candidates import captured_candidates, dataset_candidates, with_empty_views
 from bavs_jax.devices import num_shards, put_on_all
 from bavs_jax.fields.deformation import DeformationGrid, offset_unit
-from bavs_jax.fields.flow_field import FlowField
 from bavs_jax.metrics.perceptual import make_lpips_fn
 from bavs_jax.models.base import RadianceModel
-from bavs_jax.pixel_table import PixelTable, make_pixel_table, num_training_pixels
+from bavs_jax.pixel_table import make_pixel_table, num_training_pixels
 from bavs_jax.policy_inputs import InputMaker, LookOptions
-from bavs_jax.scenes import Scene
+from bavs_jax.scenes import Scene, SceneError, load_scene, sculpture
+from bavs_jax.scenes.procedural import capture
 from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.training.fit import Trainer, is_stuck, single_colour_error
@@ -33,31 +32,188 @@ from bavs_jax.uncertainty.models import MODELS
 from bavs_jax.uncertainty.models.laplace import laplace_variance
 from bavs_jax.uncertainty.posterior import default_prior_weight
 from bavs_jax.uncertainty.streaming import CurvatureOfRays, curvature_group_size
-from experiments.build_field import build_flow
-from experiments.build_scene import make_source
-from experiments.build_trainer import KINDS, RENDER_CHUNK, build_model, build_trainer, train_aside
-from experiments.errors import ConfigError
-from experiments.progress import track as show_progress
+from experiments.build_model import (
+    KINDS,
+    RENDER_CHUNK,
+    build_flow,
+    build_model,
+    build_trainer,
+    only,
+    train_aside,
+)
+from experiments.runtime import ConfigError
+from experiments.runtime import track as show_progress
+
+MAX_NEW_PIXELS = 1 << 30  # of pictures taken on the way, for which room is made at the start
+
+# The streams of randomness of a run: one key for each purpose, all of them from its seed. The key
+# of the run itself goes to `active.py`, which folds in the number of the round, 0, 1, ...; every
+# other purpose folds in a number of its own from the far end, so that no two ever draw the same.
+STREAMS = {
+    "init": 2**31 - 1,  # the parameters before training
+    "pictures": 2**31 - 2,  # uncertainty of a trained field: pictures, clean-up, exports
+    "evaluation": 2**31 - 3,  # uncertainty models that are measured on the test views
+    "surface": 2**31 - 4,  # points on a true surface and on a mesh
+    "draws": 2**31 - 5,  # fields drawn from the posterior
+    "photos": 2**31 - 6,  # curvature of all photos of a capture
+    "places": 2**31 - 7,  # poses that are suggested
+    "choice": 2**31 - 8,  # policies that choose among these
+}
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+def run_key(seed: int) -> jax.Array:
+    """The key from which all of a run's randomness comes."""
+    return jax.random.key(seed)
+
+
+def stream_key(seed: int, stream: str) -> jax.Array:
+    """The key of one of `STREAMS` of a run."""
+    return jax.random.fold_in(run_key(seed), STREAMS[stream])
+
+
+# --- the scene and its views -----------------------------------------------------------------
+
+
+def load_config_scene(config, *, cache_dir: str | None) -> Scene:
+    """The scene that a config names; SceneError if its files cannot be used."""
+    if config.loader == "procedural":
+        return load_scene("procedural", image_size=config.image_size, cache_dir=cache_dir)
+    folder, default = config.data_dir, os.environ.get("BAVS_DATA")
+    if not folder and not default:
+        raise SceneError(
+            "config.data_dir: is empty and BAVS_DATA is not set: "
+            "pass --config.data_dir=FOLDER_OF_SCENES"
+        )
+    root = os.path.join(folder or os.path.join(default, config.loader), config.scene)
+    options = {name: value for name, value in config.load.items() if value}
+    if options.get("pool_size", 0.0) >= 1:
+        options["pool_size"] = int(options["pool_size"])
+    return load_scene(config.loader, root=root, image_size=config.image_size or None, **options)
+
+
+def true_surface(config) -> Callable | None:
+    """Signed distance to the surface of a config's scene, where it is known: [..., 3] -> [...]."""
+    return sculpture.signed_distance if config.loader == "procedural" else None
+
+
+def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:
+    """Which views a run starts with: a function of seed and scene alone, never of the policy.
+
+    A `num` of 0 takes all of the pool.
+    """
+    num = num or len(scene.pool)
+    if not 1 <= num <= len(scene.pool):
+        raise SceneError(
+            f"{scene.name}: num_initial is {num}, but the pool has {len(scene.pool)} views: "
+            "give a number between 1 and that"
+        )
+    return np.random.default_rng(seed).permutation(np.asarray(scene.pool))[:num]
+
+
+def _takes_pictures(config) -> bool:
+    """Whether candidates are free poses, whose pictures are taken when they are chosen."""
+    return config.candidates.source == "hemisphere" and config.loader == "procedural"
+
+
+def check_views(config, scene: Scene) -> None:
+    """Raises an error, before any training, if a scene has fewer views than the rounds ask for."""
+    batch, num_rounds, options = config.batch_size, config.num_rounds, config.candidates
+    left = len(scene.pool) - len(initial_views(scene, 0, config.num_initial))
+    taken, draws = num_rounds * batch, options.hemisphere_draws
+    rounds = f"config.batch_size: {num_rounds} rounds of {batch} take {taken}"
+    if options.source == "hemisphere" and num_rounds and batch > draws:
+        raise ConfigError(
+            f"config.batch_size: is {batch}; give at most candidates.hemisphere_draws, {draws}"
+        )
+    if not _takes_pictures(config):
+        if taken > left:
+            raise ConfigError(
+                f"{rounds} views, but {scene.name} has {left} in the pool beside the initial "
+                "ones; give fewer"
+            )
+    elif taken * int(np.diff(scene.offsets).max()) > MAX_NEW_PIXELS:
+        raise ConfigError(
+            f"{rounds} pictures, more than {MAX_NEW_PIXELS:,} pixels; give fewer, or a smaller "
+            "image_size"
+        )
+
+
+def check_shards(config, mesh: Mesh | None) -> None:
+    """Raises ConfigError if rays cannot be spread evenly over the devices of a mesh."""
+    num_pixels, rest = divmod(config.train.num_rays, config.rays_per_pixel)
+    if rest:
+        raise ConfigError(
+            f"config.train.num_rays: {config.train.num_rays} is no multiple of "
+            f"config.rays_per_pixel, {config.rays_per_pixel}"
+        )
+    for name, num in (("config.train.num_rays", num_pixels), ("images", RENDER_CHUNK)):
+        if num % num_shards(mesh):
+            raise ConfigError(
+                f"{name}: {num} pixels at once cannot be spread over {num_shards(mesh)} devices: "
+                "take a number of --devices that divides them"
+            )
+
+
+# --- all of it together ----------------------------------------------------------------------
+
+
 class Problem:
     """One scene with everything that is compiled for it; shared by all policies and seeds."""
 
-    config: ConfigDict
-    scene: Scene
-    kind: str  # of the field that is trained and measured, one of `KINDS`
-    source: CandidateSource
-    table: PixelTable
-    models: dict[str, RadianceModel]  # by kind
-    flow: FlowField  # the distribution whose mean is the field of kind FLOW
-    trainers: dict[str, Trainer]  # by kind
-    grid: DeformationGrid
-    laplace: LaplaceOptions
-    lpips_fn: Callable | None
-    lpips_reason: str | None  # why there is none
-    track: Callable  # (total, label, unit) -> a context with `advance(n)`, for progress
-    mesh: Mesh | None  # devices that share the rays
+    def __init__(
+        self,
+        config,
+        scene: Scene,
+        kind: str = RECONSTRUCTION,
+        mesh: Mesh | None = None,
+        track: Callable = show_progress,
+    ):
+        """Puts models, training, curvature and selection together; compiles nothing yet.
+
+        Args:
+          config: see `experiments/configs/base.py`; raises ConfigError where it does not fit.
+          scene: the scene.
+          kind: of the field that is trained and measured, one of `KINDS`.
+          mesh: devices that share the rays, from `make_mesh`.
+          track: how progress is shown: (total, label, unit) -> a context with `advance(n)`.
+        """
+        check_shards(config, mesh)
+        self.config, self.scene, self.kind = config, scene, kind
+        self.mesh, self.track = mesh, track
+        # Where candidates come from, and the table with room for pictures taken on the way.
+        options, table = config.candidates, make_pixel_table(scene)
+        draws = options.hemisphere_draws if options.source == "hemisphere" else None
+        if _takes_pictures(config):
+            self.source = captured_candidates(
+                scene,
+                lambda cameras: capture(cameras)[:2],
+                num_candidates=draws,
+                first_slot=len(table.cameras),
+            )
+            table = with_empty_views(table, config.num_rounds * config.batch_size)
+        else:
+            self.source = dataset_candidates(scene, hemisphere_draws=draws)
+        self.table = put_on_all(table, mesh)
+        # The distribution over fields whose mean is the field of kind FLOW.
+        self.flow = flow = build_flow(config, scene)
+        num_views = len(table.cameras)
+        self.models = {k: build_model(config, scene, num_views, k, flow, mesh) for k in KINDS}
+        self.trainers = {k: build_trainer(config, model) for k, model in self.models.items()}
+        uncertainty = config.uncertainty
+        self.grid = DeformationGrid(
+            jnp.asarray(scene.box), uncertainty.log2_cells, contracted=scene.unbounded
+        )
+        prior_weight = uncertainty.prior_weight or default_prior_weight(uncertainty.log2_cells)
+        self.laplace = LaplaceOptions(
+            prior_weight=prior_weight / float(offset_unit(scene.box)) ** 2,
+            max_rays=uncertainty.max_rays or None,
+            **only(uncertainty, "weighting", "offset_cells", "variant", "scale", "extent"),
+        )
+        self._density = jax.jit(self.model.density)
+        self.lpips_fn, self.lpips_reason = None, "switched off: config.lpips_net is empty"
+        if config.lpips_net:
+            self.lpips_fn, self.lpips_reason = make_lpips_fn(config.lpips_net)
+        self.model_fns: Callable[[str], ModelFns] = cache(lambda n: MODELS[n].make_fns(self.setup))
 
     @property
     def model(self) -> RadianceModel:
@@ -71,8 +227,6 @@ class Problem:
     def has_empty_views(self) -> bool:
         """Whether the table has room for pictures taken on the way."""
         return len(self.table.cameras) > self.scene.num_views
-
-    # --- the field ---
 
     def restart(self, key, state: TrainState) -> TrainState:
         """Where a later round begins: a fresh optimiser, and a fresh field if so asked."""
@@ -97,13 +251,7 @@ class Problem:
 
     def density(self, train: TrainState, positions) -> jax.Array:
         """At points [K, 3]: [K] 1 / scene unit, 0 where nothing is rendered."""
-        return self._density_fn(train.model, positions)
-
-    @cached_property
-    def _density_fn(self) -> Callable:
-        return jax.jit(self.model.density)
-
-    # --- uncertainty and choice ---
+        return self._density(train.model, positions)
 
     @cached_property
     def setup(self) -> SceneSetup:
@@ -113,6 +261,8 @@ class Problem:
         def train(kind, key, acquired):
             return train_aside(config, self.trainers[kind], key, acquired, kind, self.track)
 
+        channel = only(config.uncertainty, "variant", "scale", "extent")
+        group_size = curvature_group_size(self.grid.num_vertices, len(self.table.cameras))
         return SceneSetup(
             models=self.models,
             flow=self.flow,
@@ -120,20 +270,9 @@ class Problem:
             grid=self.grid,
             laplace=self.laplace,
             curvature=CurvatureOfRays(
-                self.model,
-                self.grid,
-                group_size=curvature_group_size(self.grid.num_vertices, len(self.table.cameras)),
-                track=self.track,
-                mesh=self.mesh,
+                self.model, self.grid, group_size=group_size, track=self.track, mesh=self.mesh
             ),
-            render_chunk=make_render_chunk_fn(
-                self.model,
-                self.grid,
-                variant=self.laplace.variant,
-                scale=self.laplace.scale,
-                extent=self.laplace.extent,
-                mesh=self.mesh,
-            ),
+            render_chunk=make_render_chunk_fn(self.model, self.grid, mesh=self.mesh, **channel),
             train=train,
             image_scale=config.candidates.image_scale,
             chunk=RENDER_CHUNK,
@@ -143,30 +282,16 @@ class Problem:
         )
 
     @cached_property
-    def _made_models(self) -> dict[str, ModelFns]:
-        return {}
-
-    def model_fns(self, name: str) -> ModelFns:
-        """An uncertainty model of this scene, made when first asked for."""
-        if name not in self._made_models:
-            self._made_models[name] = MODELS[name].make_fns(self.setup)
-        return self._made_models[name]
-
-    @cached_property
     def inputs(self) -> InputMaker:
         """Where the numbers of policies come from."""
-        image_scale = self.config.candidates.image_scale
+        look = LookOptions(image_scale=self.config.candidates.image_scale, chunk=RENDER_CHUNK)
         true_error_fn = None
         if not self.has_empty_views:
             true_error_fn = make_true_error_fn(
-                self.render, self.scene, image_scale=image_scale, chunk=RENDER_CHUNK
+                self.render, self.scene, image_scale=look.image_scale, chunk=look.chunk
             )
         return InputMaker(
-            self.setup,
-            self.model_fns,
-            LookOptions(image_scale=image_scale, chunk=RENDER_CHUNK),
-            track=self.track,
-            true_error_fn=true_error_fn,
+            self.setup, self.model_fns, look, track=self.track, true_error_fn=true_error_fn
         )
 
     def acquisition(self, policy_name: str, initial, label: str) -> Acquisition:
@@ -184,79 +309,3 @@ class Problem:
             mode=options.mode or None,
             label=label,
         )
-
-
-def build_problem(
-    config,
-    scene: Scene,
-    kind: str = RECONSTRUCTION,
-    mesh: Mesh | None = None,
-    track: Callable = show_progress,
-) -> Problem:
-    """Puts models, training, curvature and selection together.
-
-    Args:
-      config: see `experiments/configs/base.py`; `check_config` has seen it.
-      scene: the scene.
-      kind: of the field that the run trains and is measured on, one of `KINDS`.
-      mesh: devices that share the work, from `make_mesh`.
-      track: how progress is shown.
-
-    Raises:
-      ConfigError: an option that cannot be used.
-    """
-    check_shards(config, mesh)
-    source, table = make_source(config, scene, make_pixel_table(scene))
-    flow = build_flow(config, scene)
-    models = {k: build_model(config, scene, len(table.cameras), k, flow, mesh) for k in KINDS}
-    lpips_fn, lpips_reason = (None, "switched off: config.lpips_net is empty")
-    if config.lpips_net:
-        lpips_fn, lpips_reason = make_lpips_fn(config.lpips_net)
-    return Problem(
-        config=config,
-        scene=scene,
-        kind=kind,
-        source=source,
-        table=put_on_all(table, mesh),
-        models=models,
-        flow=flow,
-        trainers={k: build_trainer(config, model) for k, model in models.items()},
-        grid=DeformationGrid(
-            jnp.asarray(scene.box), config.uncertainty.log2_cells, contracted=scene.unbounded
-        ),
-        laplace=_laplace_options(config, scene),
-        lpips_fn=lpips_fn,
-        lpips_reason=lpips_reason,
-        track=track,
-        mesh=mesh,
-    )
-
-
-def check_shards(config, mesh: Mesh | None) -> None:
-    """Raises ConfigError if rays cannot be spread evenly over the devices of a mesh."""
-    num_pixels, rest = divmod(config.train.num_rays, config.rays_per_pixel)
-    if rest:
-        raise ConfigError(
-            f"config.train.num_rays: {config.train.num_rays} is no multiple of "
-            f"config.rays_per_pixel, {config.rays_per_pixel}"
-        )
-    for name, num in (("config.train.num_rays", num_pixels), ("images", RENDER_CHUNK)):
-        if num % num_shards(mesh):
-            raise ConfigError(
-                f"{name}: {num} pixels at once cannot be spread over {num_shards(mesh)} devices: "
-                "take a number of --devices that divides them"
-            )
-
-
-def _laplace_options(config, scene: Scene) -> LaplaceOptions:
-    options = config.uncertainty
-    prior_weight = options.prior_weight or default_prior_weight(options.log2_cells)
-    return LaplaceOptions(
-        prior_weight=prior_weight / float(offset_unit(scene.box)) ** 2,
-        weighting=options.weighting,
-        variant=options.variant,
-        scale=options.scale,
-        extent=options.extent,
-        max_rays=options.max_rays or None,
-        offset_cells=options.offset_cells,
-    )

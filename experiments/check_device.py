@@ -19,9 +19,9 @@ from absl import flags
 
 from experiments import runtime
 from experiments.bench import same_numbers
-from experiments.errors import ConfigError
 from experiments.files import write_json
 from experiments.reporting.tables import markdown
+from experiments.runtime import ConfigError
 
 FLAGS = flags.FLAGS
 flags.DEFINE_string("workdir", None, "Folder for check_device.json.")

@@ -9,9 +9,20 @@ from PIL import Image
 from bavs_jax.cameras import num_pixels
 from bavs_jax.metrics.image import depth_mae, measure_images
 from bavs_jax.rendering.images import render_views
-from experiments.build import RENDER_CHUNK
+from experiments.build_model import RENDER_CHUNK
 from experiments.files import stack_pictures
-from experiments.progress import track
+from experiments.runtime import track
+
+
+def evenly_spaced(view_ids, num: int) -> np.ndarray:
+    """`num` of the views, evenly spaced in their order; all of them if `num` is 0."""
+    view_ids = np.asarray(view_ids)
+    if num == 0 or num >= len(view_ids):
+        return view_ids
+    return view_ids[np.arange(num) * len(view_ids) // num]
+
+
+# --- without a field -------------------------------------------------------------------------
 
 
 def image_psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -25,20 +36,17 @@ def image_psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = N
 
 
 def measure_baselines(scene, training_views, test_views) -> dict[str, float]:
-    """Mean PSNR over test views of the two pictures that anyone would guess.
+    """Mean PSNR in dB over test views of the two pictures that anyone would guess.
 
-    Args:
-      scene: the scene.
-      training_views: [n] view ids that are trained on.
-      test_views: [m] view ids.
-
-    Returns:
-      `mean_colour_psnr`, of the mean colour of all training pixels, and `nearest_image_psnr`, of
-      the training view whose camera is closest, stretched to the test view's size; dB.
+    They are the mean colour of all training pixels (`mean_colour_psnr`) and the training view whose
+    camera is closest, stretched to the test view's size (`nearest_image_psnr`).
     """
     training_views = np.asarray(training_views)
-    rows = np.concatenate([_kept_pixels(scene, view) for view in training_views])
-    mean_colour = np.round(rows.mean(axis=0, dtype=np.float64))
+    rows = []
+    for view in training_views:
+        kept = slice(None) if scene.pixel_mask is None else scene.pixel_mask[scene.view_slice(view)]
+        rows.append(scene.pixels[scene.view_slice(view)][kept])
+    mean_colour = np.round(np.concatenate(rows).mean(axis=0, dtype=np.float64))
     positions = np.asarray(scene.cameras.positions)
     by_mean, by_nearest = [], []
     for view in test_views:
@@ -50,23 +58,11 @@ def measure_baselines(scene, training_views, test_views) -> dict[str, float]:
             nearest = np.asarray(Image.fromarray(nearest).resize(size, Image.Resampling.BILINEAR))
         by_mean.append(image_psnr(np.broadcast_to(mean_colour, truth.shape), truth, mask))
         by_nearest.append(image_psnr(nearest, truth, mask))
-    return {
-        "mean_colour_psnr": float(np.mean(by_mean)),
-        "nearest_image_psnr": float(np.mean(by_nearest)),
-    }
+    means = {"mean_colour_psnr": np.mean(by_mean), "nearest_image_psnr": np.mean(by_nearest)}
+    return {name: float(value) for name, value in means.items()}
 
 
-def _kept_pixels(scene, view: int) -> np.ndarray:
-    rows = scene.pixels[scene.view_slice(view)]
-    return rows if scene.pixel_mask is None else rows[scene.pixel_mask[scene.view_slice(view)]]
-
-
-def evenly_spaced(view_ids, num: int) -> np.ndarray:
-    """`num` of the views, evenly spaced in their order; all of them if `num` is 0."""
-    view_ids = np.asarray(view_ids)
-    if num == 0 or num >= len(view_ids):
-        return view_ids
-    return view_ids[np.arange(num) * len(view_ids) // num]
+# --- of a field ------------------------------------------------------------------------------
 
 
 def evaluate_views(
@@ -75,7 +71,7 @@ def evaluate_views(
     """Mean image measures over views by the 8-bit protocol, and the mean depth error.
 
     Args:
-      render_fn: `Rays` [chunk] -> dict with "rgb", "depth" and "opacity".
+      render_fn: `Rays` [chunk] -> dict with "rgb", "depth", "opacity" and "thinned".
       scene: the scene with the true images.
       view_ids: [n] which views.
       rays_per_pixel: see `render_views`; as many as the field was trained with.
@@ -125,17 +121,9 @@ def render_with_bar(
 
 
 def measure_test_views(problem, train, num: int, label: str) -> dict:
-    """`evaluate_views` of a trained field on `num` test views of its problem, with progress.
-
-    Args:
-      problem: from `build_problem`.
-      train: `TrainState`.
-      num: of the test views; see `evenly_spaced`.
-      label: of the progress bar.
-    """
-    scene = problem.scene
+    """`evaluate_views` of a trained field on `num` test views (0: all), with progress."""
+    scene, rays_per_pixel = problem.scene, problem.config.rays_per_pixel
     view_ids = evenly_spaced(scene.test, num)
-    rays_per_pixel = problem.config.rays_per_pixel
     num_rays = rays_per_pixel * int(sum(np.diff(scene.offsets)[view_ids]))
     with track(num_rays, f"{label}: {len(view_ids)} test views", "rays") as bar:
         return evaluate_views(
@@ -149,9 +137,16 @@ def measure_test_views(problem, train, num: int, label: str) -> dict:
 
 
 def mean_quality(scene, view_ids, images: list[dict], *, lpips_fn=None) -> dict:
-    """Means over views of what `evaluate_views` measures, of images that are rendered already."""
+    """Means over views of what `evaluate_views` measures, of images that are rendered already.
+
+    A view without known depth has no depth error, one without valid pixels no measure at all.
+    """
     rows = [_measure(scene, v, image, lpips_fn) for v, image in zip(view_ids, images)]
-    return {k: _mean([row.get(k) for row in rows]) for k in ("psnr", "ssim", "lpips", "depth_mae")}
+    means = {}
+    for name in ("psnr", "ssim", "lpips", "depth_mae"):
+        known = [row[name] for row in rows if row.get(name) is not None]
+        means[name] = float(np.mean(known)) if known else None
+    return means
 
 
 _measure_images = jax.jit(measure_images, static_argnames="lpips_fn")
@@ -169,12 +164,6 @@ def _measure(scene, view_id: int, image: dict, lpips_fn) -> dict[str, float]:
     if true_depth is not None and (true_depth > 0).any():
         row["depth_mae"] = depth_mae(image["depth"], true_depth)
     return {k: float(v) for k, v in row.items() if v is not None}
-
-
-def _mean(values) -> float | None:
-    """Mean of the values that exist: a view without known depth has no depth error."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
 
 
 def picture_arrays(render_fn, scene, view_ids, *, rays_per_pixel: int = 1) -> dict[str, np.ndarray]:

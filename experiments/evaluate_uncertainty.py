@@ -17,9 +17,9 @@ import time
 from absl import flags
 from ml_collections import config_flags
 
-from experiments import runtime, workdir
-from experiments.build import build_problem
-from experiments.build_scene import check_views, load_config_scene
+from experiments import runtime
+from experiments.build import Problem, check_views, load_config_scene
+from experiments.files import check_claim, claim
 from experiments.schema import given_config
 from experiments.uncertainty import measure_seed, write_summary
 
@@ -38,11 +38,11 @@ flags.DEFINE_string("workdir", None, "Folder for fields, uncertainty.json and un
 def evaluate(config, folder: pathlib.Path, command: str) -> None:
     """All seeds, then the summary and the page."""
     start = time.monotonic()
-    workdir.check_claim(folder, config)
+    check_claim(folder, config)
     scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     check_views(config, scene)
-    problem = build_problem(config, scene)
-    workdir.claim(folder, config)
+    problem = Problem(config, scene)
+    claim(folder, config)
     for seed in config.seeds:
         measure_seed(config, problem, folder, seed, command)
     numbers, page = write_summary(config, scene, folder, command)

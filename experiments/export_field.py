@@ -43,15 +43,13 @@ from bavs_jax.scenes.poses import user_points, user_units
 from bavs_jax.scenes.sdf_surface import sample_surface
 from bavs_jax.uncertainty.channel import finish_uncertainty
 from experiments import runtime
-from experiments.build import RENDER_CHUNK
-from experiments.build_scene import true_surface
-from experiments.errors import ConfigError
+from experiments.build import stream_key, true_surface
+from experiments.build_model import RENDER_CHUNK
 from experiments.files import write_arrays, write_atomic
-from experiments.keys import stream_key
 from experiments.posthoc import script
-from experiments.progress import track
 from experiments.reporting.result_tables import geometry_table
 from experiments.reporting.tables import markdown
+from experiments.runtime import ConfigError, track
 from experiments.trained import TrainedRun
 
 # Of the box's longest side: the shell that the true surface is drawn from, and how far from that

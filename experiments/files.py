@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and read with one-line errors."""
+"""Files that are written whole or not at all, and what the folder of an experiment holds."""
 
 from __future__ import annotations
 
@@ -9,18 +9,37 @@ import json
 import os
 import pathlib
 from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
+from ml_collections import ConfigDict
 
-from experiments.errors import WorkdirError
-from experiments.runtime import warn
-from experiments.signals import is_first_process
+from bavs_jax.selection.policies import get_policy
+from bavs_jax.uncertainty.model import RECONSTRUCTION
+from experiments.runtime import WorkdirError, is_first_process, reason, warn
+
+SUMMARY_VERSION = 1
+PICTURES = ("truth", "rgb", "error", "uncertainty", "depth", "half")
+# What may differ when a folder is taken up again: more policies or seeds add runs.
+EXTENSIBLE = (
+    *("policies", "seeds", "checkpoint_seconds", "data_dir", "num_pictures"),
+    *("evaluation.models", "evaluation.variant"),
+)
+
+# --- writing: of several processes that work together, the first one does it ----------------------
+
+
+@contextlib.contextmanager
+def _named_errors(path: str | os.PathLike) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        fix = "make room there, then start again"
+        raise WorkdirError(f"{path}: cannot be written ({reason(error)}): {fix}") from error
 
 
 def write_atomic(path: str | os.PathLike, write_fn: Callable) -> None:
     """Calls `write_fn(file)` on a temporary binary file beside `path`, then renames it.
-
-    Of several processes that work together, the first one writes; so it is everywhere here.
 
     Raises:
       WorkdirError: it cannot be written, such as to a full disk.
@@ -31,16 +50,12 @@ def write_atomic(path: str | os.PathLike, write_fn: Callable) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with open(temporary, "wb") as file:
-            write_fn(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise WorkdirError(
-            f"{path}: cannot be written ({error.strerror or error}): make room there, then start "
-            "again"
-        ) from error
+        with _named_errors(path):
+            with open(temporary, "wb") as file:
+                write_fn(file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -61,70 +76,13 @@ def append_line(path: str | os.PathLike, value: dict) -> None:
     if not is_first_process():
         return
     line = (json.dumps(value, allow_nan=False) + "\n").encode()
-    try:
-        with open(path, "ab+", buffering=0) as file:
-            # The lock is for folders that machines share: only there may two lines overlap.
-            fcntl.flock(file, fcntl.LOCK_EX)
-            if file.seek(0, os.SEEK_END) and os.pread(file.fileno(), 1, file.tell() - 1) != b"\n":
-                line = b"\n" + line  # what was being written when a process was killed
-            if file.write(line) < len(line):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    except OSError as error:
-        raise WorkdirError(
-            f"{path}: cannot be written ({error.strerror}): make room there, then start again"
-        ) from error
-
-
-def read_json(path: str | os.PathLike, otherwise: str = "made again") -> dict | None:
-    """What `write_json` has written; None where there is nothing or, after a warning, a damaged
-    file.
-
-    Args:
-      path: of the file.
-      otherwise: what is done about a damaged one.
-    """
-    try:
-        value = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
-        if isinstance(value, dict):
-            return value
-        reason = "not a JSON object"
-    except FileNotFoundError:
-        return None
-    except (ValueError, RecursionError) as error:
-        reason = f"not JSON: {error}"
-    warn(f"{path}: damaged ({reason}): {otherwise}")
-    return None
-
-
-def read_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray] | None:
-    """What `write_arrays` has written, with some names; None as in `read_json`."""
-    try:
-        return load_arrays(path, *names)
-    except FileNotFoundError:
-        return None
-    except ValueError as error:
-        warn(f"{error}: made again")
-        return None
-
-
-def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
-    """The arrays of an `.npz`.
-
-    Raises:
-      FileNotFoundError: there is no file.
-      ValueError: it is damaged or lacks one of `names`; names the file.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except FileNotFoundError:
-        raise
-    # Of zip, zlib, the header's tokens and the size it claims, damage may break any.
-    except Exception as error:
-        raise ValueError(f"{path}: damaged ({' '.join(str(error).split())})") from error
-    if missing := [name for name in names if name not in arrays]:
-        raise ValueError(f"{path}: lacks {', '.join(missing)}")
-    return arrays
+    with _named_errors(path), open(path, "ab+", buffering=0) as file:
+        # The lock is for folders that machines share: only there may two lines overlap.
+        fcntl.flock(file, fcntl.LOCK_EX)
+        if file.seek(0, os.SEEK_END) and os.pread(file.fileno(), 1, file.tell() - 1) != b"\n":
+            line = b"\n" + line  # what was being written when a process was killed
+        if file.write(line) < len(line):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @contextlib.contextmanager
@@ -141,18 +99,68 @@ def exclusive(folder: str | os.PathLike, *, wait: bool = True) -> Iterator[None]
         return
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    busy = f"{folder}: another process works here"
     with open(folder / ".lock", "wb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             if not wait:
-                raise WorkdirError(
-                    f"{folder}: another process works here; wait for its end, or use another "
-                    "--workdir"
-                ) from None
-            print(f"{folder}: another process works here; waiting for its end", flush=True)
+                raise WorkdirError(f"{busy}; wait for its end, or use another --workdir") from None
+            print(f"{busy}; waiting for its end", flush=True)
             fcntl.flock(file, fcntl.LOCK_EX)
         yield
+
+
+# --- reading ---------------------------------------------------------------------------------
+
+
+def load_json(path: str | os.PathLike) -> dict:
+    """A JSON object; FileNotFoundError, or a ValueError that names a damaged file."""
+    try:
+        value = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: damaged (not JSON: {error})") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{path}: damaged (not a JSON object)")
+    return value
+
+
+def load_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray]:
+    """The arrays of an `.npz`; an error as in `load_json`, also where one of `names` is missing."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise
+    # Of zip, zlib, the header's tokens and the size it claims, damage may break any.
+    except Exception as error:
+        raise ValueError(f"{path}: damaged ({' '.join(str(error).split())})") from error
+    if missing := [name for name in names if name not in arrays]:
+        raise ValueError(f"{path}: lacks {', '.join(missing)}")
+    return arrays
+
+
+def read_json(path: str | os.PathLike, otherwise: str = "made again") -> dict | None:
+    """What `write_json` has written; None where there is no file or it is damaged.
+
+    Of a damaged one a warning says what is done `otherwise`.
+    """
+    return _read(load_json, path, otherwise=otherwise)
+
+
+def read_arrays(path: str | os.PathLike, *names: str) -> dict[str, np.ndarray] | None:
+    """What `write_arrays` has written, with some names; None as in `read_json`."""
+    return _read(load_arrays, path, *names, otherwise="made again")
+
+
+def _read(load_fn: Callable, path, *names: str, otherwise: str):
+    try:
+        return load_fn(path, *names)
+    except FileNotFoundError:
+        pass
+    except ValueError as error:
+        warn(f"{error}: {otherwise}")
+    return None
 
 
 def read_versioned(
@@ -160,59 +168,157 @@ def read_versioned(
 ) -> dict:
     """The content of a JSON object whose `schema_version` this program knows.
 
-    Args:
-      path: of the file.
-      version: that it must have.
-      error: what to raise.
-      absent: what to do where there is no file, in the imperative.
-      fix: what to do where it is broken or of another version.
-
-    Raises:
-      error: one line that names the file, the field and the fix.
+    If it cannot be used, an `error` names the file, the field and what to do: `absent` where there
+    is no file, `fix` where it is broken or of another version.
     """
     try:
-        content = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
+        content = load_json(path)
     except FileNotFoundError:
         raise error(f"{path}: no such file; {absent}") from None
-    except ValueError as problem:  # not JSON, or not text
-        raise error(f"{path}: not JSON ({problem}); {fix}") from None
-    if not isinstance(content, dict):
-        raise error(f"{path}: not a JSON object; {fix}")
-    found = content.get("schema_version")
-    if found != version:
+    except ValueError as problem:
+        raise error(f"{problem}; {fix}") from None
+    if (found := content.get("schema_version")) != version:
         raise error(f"{path}: schema_version is {found}, this program reads {version}; {fix}")
     return content
 
 
 # --- pictures of several sizes in one array ---
 
-PICTURES = ("truth", "rgb", "error", "uncertainty", "depth", "half")
-
 
 def stack_pictures(images: list[np.ndarray]) -> np.ndarray:
     """Images [H_v, W_v, ...] as one array [n, H, W, ...] of the largest size, filled up with 0."""
     height, width = np.max([image.shape[:2] for image in images], axis=0)
-    first = images[0]
-    stacked = np.zeros((len(images), height, width, *first.shape[2:]), first.dtype)
+    stacked = np.zeros((len(images), height, width, *images[0].shape[2:]), images[0].dtype)
     for whole, image in zip(stacked, images):
         whole[: image.shape[0], : image.shape[1]] = image
     return stacked
 
 
 def cut_pictures(arrays: dict) -> dict:
-    """The content of a file of pictures, each picture again at its own size.
+    """The content of a file of pictures, each of `PICTURES` a list of images [H_v, W_v, ...].
 
-    Args:
-      arrays: `PICTURES` as from `stack_pictures`, and `sizes` [n, 2] (width, height), without
-        which all are of one size.
-
-    Returns:
-      The same, with a list of [H_v, W_v, ...] in place of each array of `PICTURES`.
+    `sizes` [n, 2] (width, height) says how large they are; without, all are of one size.
     """
     if "sizes" not in arrays:
         return arrays
-    sizes, names = arrays["sizes"], [name for name in PICTURES if name in arrays]
-    return arrays | {
-        name: [image[:height, :width] for image, (width, height) in zip(arrays[name], sizes)]
-        for name in names
-    }
+    cut = {}
+    for name in PICTURES:
+        if name in arrays:
+            pairs = zip(arrays[name], arrays["sizes"])
+            cut[name] = [image[:height, :width] for image, (width, height) in pairs]
+    return arrays | cut
+
+
+# --- parts of an experiment ------------------------------------------------------------------
+
+
+class Part(NamedTuple):
+    """A policy with a seed, or round 0 of a seed, which all policies of a field kind share.
+
+    Each has a folder of its own, such as `bavs/seed_0` and `initial/seed_0`.
+    """
+
+    policy: str | None  # None: round 0
+    kind: str  # of the field that is trained
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Its folder in the working folder."""
+        first = "initial" if self.kind == RECONSTRUCTION else f"initial_{self.kind}"
+        return f"{self.policy or first}/seed_{self.seed}"
+
+    @property
+    def initial(self) -> Part:
+        """The part that makes the round 0 it starts from."""
+        return self._replace(policy=None)
+
+
+def all_parts(policies, seeds) -> list[Part]:
+    """Every part of an experiment, round 0 before what starts from it, seed by seed."""
+    parts = [Part(p, get_policy(p).field_kind, seed) for seed in seeds for p in policies]
+    return list(dict.fromkeys(p for part in parts for p in (part.initial, part)))
+
+
+def is_finished(workdir: pathlib.Path, part: Part) -> bool:
+    """Whether all files of a part are written, and none is damaged."""
+    folder = workdir / part.name
+    if part.policy is None:
+        return read_json(folder / "round_0.json") is not None
+    pictures = folder / "pictures.npz"  # of the first seed only
+    return (
+        is_completed(read_json(folder / "result.json"))
+        and read_json(folder / "next_views" / "transforms.json") is not None
+        and read_arrays(folder / "acquisition.npz") is not None
+        and (not pictures.exists() or read_arrays(pictures) is not None)
+    )
+
+
+def is_completed(result: dict | None) -> bool:
+    """Whether a result file is there, and of a run that has come to its end."""
+    return result is not None and bool(result.get("completed"))
+
+
+# --- the config and the results --------------------------------------------------------------
+
+
+def leaves(config, prefix: str = "") -> dict:
+    """Every option by its dotted name; a group that is no group counts as an option."""
+    found = {}
+    for key, value in config.items():
+        if isinstance(value, (dict, ConfigDict)):
+            found |= leaves(value, f"{prefix}{key}.")
+        else:
+            found[f"{prefix}{key}"] = value
+    return found
+
+
+def check_claim(workdir: pathlib.Path, config) -> None:
+    """Raises WorkdirError if a folder holds runs of another config; writes nothing."""
+    path = workdir / "config.json"
+    checkpoints = (p.name.isdigit() for p in workdir.glob("*/seed_*/checkpoints/*"))
+    has_work = any(checkpoints) or any(workdir.glob("*/seed_*/result.json"))
+    if not has_work or not path.exists():
+        return
+    try:
+        before = load_json(path)
+    except ValueError as error:
+        raise WorkdirError(
+            f"{error}: delete it if the runs there are of this config, and start again; or use "
+            "another --workdir"
+        ) from error
+    old, new = ({k: json.dumps(v) for k, v in leaves(c).items()} for c in (before, config))
+    for option, _ in sorted(old.items() ^ new.items()):
+        if option not in EXTENSIBLE:
+            raise WorkdirError(
+                f"{path}: {option}: differs from the run that is there; "
+                "use another --workdir or the same config"
+            )
+
+
+def claim(workdir: pathlib.Path, config) -> None:
+    """Makes a folder and its `config.json`; to be called when all else has been checked."""
+    check_claim(workdir, config)
+    write_json(workdir / "config.json", config.to_dict())
+
+
+def collect(workdir: pathlib.Path) -> dict:
+    """Collects all `<policy>/seed_<n>/result.json` into `summary.json`."""
+    runs = {}
+    for path in workdir.glob("*/seed_*/result.json"):
+        policy, seed = path.parts[-3], path.parts[-2].removeprefix("seed_")
+        if not seed.isdecimal():
+            warn(f"{path.parent}: not seed_<number>: left out of summary.json")
+        elif result := read_json(path, "left out of summary.json until its run is started again"):
+            runs[policy, int(seed)] = result
+    summary = {"schema_version": SUMMARY_VERSION, "runs": [runs[key] for key in sorted(runs)]}
+    write_json(workdir / "summary.json", summary)
+    return summary
+
+
+def export_next_views(workdir: pathlib.Path, policy: str, seed: int) -> pathlib.Path:
+    """Copies one run's chosen poses to `next_views/transforms.json`."""
+    source = workdir / policy / f"seed_{seed}" / "next_views" / "transforms.json"
+    target = workdir / "next_views" / "transforms.json"
+    write_atomic(target, lambda file: file.write(source.read_bytes()))
+    return target

@@ -13,32 +13,32 @@ from jax.sharding import Mesh
 
 from bavs_jax import active
 from bavs_jax.active import ActiveState, Choice
+from bavs_jax.cameras import Cameras, take
 from bavs_jax.devices import num_shards
 from bavs_jax.pixel_table import num_training_pixels
+from bavs_jax.scenes.base import photo_cameras
+from bavs_jax.scenes.poses import user_transforms
 from bavs_jax.training.checkpoints import Checkpoints
-from bavs_jax.training.fit import MAX_RESTARTS, fit
+from bavs_jax.training.fit import MAX_RESTARTS
 from bavs_jax.uncertainty.model import Acquired
-from experiments import acquisitions, runtime, workdir
-from experiments.build import Problem, build_problem
-from experiments.build_scene import check_views, initial_views, load_config_scene
-from experiments.errors import WorkdirError
-from experiments.evaluate import (
-    evenly_spaced,
-    measure_baselines,
-    measure_test_views,
-    picture_arrays,
+from experiments import evaluate, files, runtime
+from experiments.build import (
+    Problem,
+    check_views,
+    initial_views,
+    load_config_scene,
+    run_key,
+    stream_key,
 )
-from experiments.files import append_line, exclusive, read_json, write_arrays, write_json
-from experiments.keys import run_key, stream_key
-from experiments.progress import track
+from experiments.build_model import train_with_bar
+from experiments.files import Part, load_arrays, write_arrays, write_json
 from experiments.reporting.report import write_report
 from experiments.reporting.results import bound_words
-from experiments.runtime import device_name, peak_memory_mb, versions, warn
-from experiments.signals import as_first_process, is_first_process
-from experiments.workdir import Part, all_parts, find_part, is_completed, is_finished
+from experiments.runtime import ConfigError, WorkdirError, is_first_process, warn
 
 SCHEMA_VERSION = 1
 LOG_EVERY = 10  # training calls between two lines of metrics.jsonl
+CAMERA_FIELDS = ("world_from_cam", "intrinsics", "distortion", "sizes")
 
 
 class Run:
@@ -50,8 +50,7 @@ class Run:
 
     def __init__(self, config, problem: Problem, workdir: pathlib.Path, policy, seed, command=""):
         self.config, self.problem, self.workdir = config, problem, workdir
-        self.command = command
-        self.policy, self.seed = policy, seed
+        self.policy, self.seed, self.command = policy, seed, command
         self.label = f"{policy or 'initial'} seed {seed}"
         self.part = Part(policy, problem.kind, seed)
         self.folder = workdir / self.part.name
@@ -59,25 +58,23 @@ class Run:
         self.initial = initial_views(problem.scene, view_seed, config.num_initial)
         self.rounds: list[dict] = []  # of result.json
         self.pending = _new_pending()  # what is known of the round under way
-        self._is_restored = False  # whether a checkpoint was there
         self.checkpoints = Checkpoints(self.folder / "checkpoints", warn_fn=warn)
 
     def finish(self, shared: Run | None = None) -> None:
         """Goes on from the last checkpoint to the last round and writes all files of the run.
 
-        Args:
-          shared: the finished run of round 0 to start from; None to make round 0 here.
+        Without a checkpoint it goes on from the finished run of round 0 that is `shared`.
         """
-        state = self._start(shared)
-        if self.policy and not is_finished(self.workdir, self.part):
-            acquisitions.load_choices(self.folder, int(state.round))  # whether they can be read
+        state = self._restored(self) or (shared and self._restored(shared)) or self._fresh()
+        if self.policy and not files.is_finished(self.workdir, self.part):
+            load_choices(self.folder, int(state.round))  # whether they can be read
         last_round = self.config.num_rounds if self.policy else 0
         while True:
             number = int(state.round)
-            if not self._is_trained(state):
+            if int(state.calls) < self.problem.trainer.num_calls:
                 state = self._train(state)
             if len(self.rounds) == number:
-                self._measure_round(state, is_last=number == self.config.num_rounds)
+                self._measure_round(state)
             if self.policy:
                 self._write_files(state, completed=number == last_round)
             if number >= last_round:
@@ -88,22 +85,15 @@ class Run:
         self.checkpoints.close()
 
     def state(self) -> ActiveState:
-        """The state of the last checkpoint.
-
-        Raises:
-          WorkdirError: there is none that can be read.
-        """
-        state = self._start(None)
-        if not self._is_restored:
+        """The state of the last checkpoint; raises WorkdirError if none can be read."""
+        state = self._restored(self)
+        if state is None:
             raise WorkdirError(
                 f"{self.folder}: holds no checkpoint that can be read: start its run again"
             )
         return state
 
     # --- one round ---
-
-    def _is_trained(self, state: ActiveState) -> bool:
-        return int(state.calls) >= self.problem.trainer.num_calls
 
     def _choose(self, state: ActiveState) -> ActiveState:
         """Opens the next round with the views that the policy chooses."""
@@ -112,119 +102,89 @@ class Run:
         acquisition = self.problem.acquisition(self.policy, self.initial, self.label)
         choice = active.select(choose_key, state, acquisition)
         state, view_ids = active.update(state, choice, acquisition.source)
-        self._record_choice(number, choice, view_ids)
+        save_choice(self.folder, number, choice, in_scene=not self.problem.has_empty_views)
+        info, filtered = choice.selection, choice.selection.filter
+        self.pending = _new_pending() | {
+            "selected": view_ids.tolist(),
+            "num_candidates": int(choice.candidates.mask.sum()),
+            "num_survivors": int(info.survivors.sum()) if filtered else None,
+            "farthest_overlap": int(info.farthest_overlap),
+            "survivors_farthest_overlap": (
+                int(info.survivors_farthest_overlap) if filtered else None
+            ),
+            "batch_bound": info.bound._asdict() if info.bound else None,
+        }
+        self.pending["seconds"] |= choice.seconds
+        self._log("choice", number, **self.pending)
+        if info.bound:
+            print(f"{self.label}: {bound_words(self.pending['batch_bound'])}")
         return state.replace(train=self.problem.restart(restart_key, state.train))
 
     def _train(self, state: ActiveState) -> ActiveState:
         """Trains the round to its end, with a bar, a log and checkpoints."""
-        trainer, steps = self.problem.trainer, self.config.train.steps_per_call
-        _, _, train_key = active.round_keys(run_key(self.seed), int(state.round))
-        left = (trainer.num_calls - int(state.calls)) * steps
-        label = f"{self.label}: train on {int(state.is_training_view.sum())} views"
-        with track(left, label, "steps") as bar:
-            clock = saved = time.monotonic()
-            for fitted in fit(
-                train_key,
-                trainer,
-                state.train,
-                state.table,
-                state.is_training_view,
-                calls=int(state.calls),
-                restarts=int(state.restarts),
-                label=f"round {int(state.round)}",
-            ):
-                state, info = active.trained(state, fitted), jax.block_until_ready(fitted.info)
-                self.pending["seconds"]["train"] += time.monotonic() - clock
-                at_end = self._is_trained(state)
-                if fitted.restarts > self.pending["restarts"]:
-                    self._record_restart(state, info)
-                if at_end:
-                    self.pending["stuck"] = self.problem.is_stuck(info, state)
-                numbers = {"loss": float(info.loss), "psnr": float(-10 * jnp.log10(info.loss))}
-                bar.advance(steps, **numbers)
-                if fitted.calls % LOG_EVERY == 0 or at_end:
-                    shape = {k: float(getattr(info, k)) for k in ("rays", "samples", "thinned")}
-                    at = {"round": int(state.round), "step": fitted.calls * steps}
-                    self._log(event="train", **at, **numbers, **shape)
-                due = as_first_process(time.monotonic() - saved > self.config.checkpoint_seconds)
-                if due or at_end:
-                    self._save(state)
-                    saved = time.monotonic()
-                clock = time.monotonic()
-        return state
-
-    def _record_restart(self, state: ActiveState, info) -> None:
-        self.pending["restarts"] = int(state.restarts)
-        at = {"round": int(state.round), "restarts": int(state.restarts)}
-        self._log(event="restart", **at, loss=float(info.loss), thinned=float(info.thinned))
-        warn(
-            f"{self.label}: round {int(state.round)}: the field is stuck (loss "
-            f"{float(info.loss):.3g}, {float(info.thinned):.0%} of the rays full of fog): "
-            "trained anew with another key"
-        )
-
-    def _record_choice(self, number: int, choice: Choice, view_ids: np.ndarray) -> None:
-        in_scene = not self.problem.has_empty_views
-        acquisitions.save_choice(self.folder, number, choice, in_scene=in_scene)
-        info = choice.selection
-        self.pending = _new_pending()
-        self.pending["seconds"] |= choice.seconds
-        self.pending |= {
-            "selected": view_ids.tolist(),
-            "num_candidates": int(choice.candidates.mask.sum()),
-            "num_survivors": int(info.survivors.sum()) if info.filter else None,
-            "farthest_overlap": int(info.farthest_overlap),
-            "survivors_farthest_overlap": (
-                int(info.survivors_farthest_overlap) if info.filter else None
-            ),
-            "batch_bound": info.bound._asdict() if info.bound else None,
-        }
-        self._log(event="choice", round=number, **self.pending)
-        if info.bound:
-            print(f"{self.label}: {bound_words(self.pending['batch_bound'])}")
-
-    def _measure_round(self, state: ActiveState, *, is_last: bool) -> None:
-        start = time.monotonic()
-        num = self.config.num_test_final if is_last else self.config.num_test
-        measures = measure_test_views(self.problem, state.train, num, self.label)
-        pending = self.pending
-        if int(state.round) == 0:
-            pending["selected"] = self.initial.tolist()
-        pending["seconds"]["evaluate"] = time.monotonic() - start
-        row = {"num_views": int(state.is_training_view.sum()), **pending, **measures}
-        self.rounds.append(row)
-        self.pending = _new_pending()
-        self._save(state)
-        self._log(event="round", round=int(state.round), **row)
-
-    def _uncertain_render_fn(self, state: ActiveState):
-        """Renders colour and uncertainty (Fig 4) of a state that may come from disk."""
-        num_rays = int(num_training_pixels(self.problem.scene, self.initial).sum())
-        fns = self.problem.model_fns("laplace")
-        acquired = Acquired(
+        problem, number, pending = self.problem, int(state.round), self.pending
+        _, _, train_key = active.round_keys(run_key(self.seed), number)
+        clock = saved = time.monotonic()
+        for fitted in train_with_bar(
+            train_key,
+            problem.trainer,
             state.train,
             state.table,
             state.is_training_view,
-            num_rays,
-            label=f"{self.label}: pictures",
-        )
-        fitted = fns.fit(stream_key(self.seed, "pictures"), acquired)
-        return partial(fns.render, fitted, state.train)
+            steps_per_call=self.config.train.steps_per_call,
+            label=f"{self.label}: train on {int(state.is_training_view.sum())} views",
+            calls=int(state.calls),
+            restarts=int(state.restarts),
+        ):
+            state, info = active.trained(state, fitted), fitted.info
+            pending["seconds"]["train"] += time.monotonic() - clock
+            shape = {name: float(getattr(info, name)) for name in ("rays", "samples", "thinned")}
+            loss = float(info.loss)
+            at_end = fitted.calls >= problem.trainer.num_calls
+            if fitted.calls == 0:
+                pending["restarts"] = fitted.restarts
+                event = {"restarts": fitted.restarts, "loss": loss, "thinned": shape["thinned"]}
+                self._log("restart", number, **event)
+            if at_end:
+                pending["stuck"] = problem.is_stuck(info, state)
+            if fitted.calls % LOG_EVERY == 0 or at_end:
+                step = fitted.calls * self.config.train.steps_per_call
+                numbers = {"loss": loss, "psnr": float(-10 * jnp.log10(info.loss))}
+                self._log("train", number, step=step, **numbers, **shape)
+            due = time.monotonic() - saved > self.config.checkpoint_seconds
+            if runtime.as_first_process(due) or at_end:
+                self._save(state)
+                saved = time.monotonic()
+            clock = time.monotonic()
+        return state
 
-    # --- files ---
+    def _measure_round(self, state: ActiveState) -> None:
+        number, config, start = int(state.round), self.config, time.monotonic()
+        num = config.num_test_final if number == config.num_rounds else config.num_test
+        measures = evaluate.measure_test_views(self.problem, state.train, num, self.label)
+        if number == 0:
+            self.pending["selected"] = self.initial.tolist()
+        self.pending["seconds"]["evaluate"] = time.monotonic() - start
+        row = {"num_views": int(state.is_training_view.sum()), **self.pending, **measures}
+        self.rounds.append(row)
+        self.pending = _new_pending()
+        self._save(state)
+        self._log("round", number, **row)
 
-    def _start(self, shared: Run | None) -> ActiveState:
-        """The last checkpoint's state, or the one where `shared` ended, or a fresh one."""
-        init_key = stream_key(self.seed, "init")
-        fresh = active.init(self.problem.trainer.init(init_key), self.problem.table, self.initial)
-        for run in (self, shared):
-            found = run and run.checkpoints.restore(saved_part(self.problem, fresh))
-            if found:
-                saved, meta = found
-                self.rounds, self.pending = meta["rounds"], meta["pending"]
-                self._is_restored = True
-                return whole_state(self.problem, saved)
-        return fresh
+    # --- checkpoints ---
+
+    def _fresh(self) -> ActiveState:
+        train = self.problem.trainer.init(stream_key(self.seed, "init"))
+        return active.init(train, self.problem.table, self.initial)
+
+    def _restored(self, run: Run) -> ActiveState | None:
+        """The state of a run's last checkpoint, from where this one goes on; None without one."""
+        found = run.checkpoints.restore(saved_part(self.problem, self._fresh()))
+        if found is None:
+            return None
+        saved, meta = found
+        self.rounds, self.pending = meta["rounds"], meta["pending"]
+        return whole_state(self.problem, saved)
 
     def _save(self, state: ActiveState) -> None:
         """Writes a checkpoint; its number grows with rounds, restarts, calls and measures."""
@@ -234,37 +194,46 @@ class Run:
         meta = {"rounds": self.rounds, "pending": self.pending}
         self.checkpoints.save(number, saved_part(self.problem, state), meta)
 
+    # --- files ---
+
     def _write_files(self, state: ActiveState, *, completed: bool) -> None:
-        if is_finished(self.workdir, self.part):
+        if files.is_finished(self.workdir, self.part):
             return
-        scene, config = self.problem.scene, self.config
-        path, pictures_path = self.folder / "result.json", self.folder / "pictures.npz"
-        if completed and (self.seed == config.seeds[0] or pictures_path.exists()):
-            view_ids = evenly_spaced(scene.test, config.num_pictures)
-            pictures = picture_arrays(
-                self._uncertain_render_fn(state),
-                scene,
-                view_ids,
-                rays_per_pixel=config.rays_per_pixel,
-            )
-            write_arrays(pictures_path, **pictures, round=int(state.round))
+        scene, folder = self.problem.scene, self.folder
+        path, pictures_path = folder / "result.json", folder / "pictures.npz"
+        if completed and (self.seed == self.config.seeds[0] or pictures_path.exists()):
+            write_arrays(pictures_path, **self._pictures(state), round=int(state.round))
         if not is_first_process():
             return
-        choices = acquisitions.load_choices(self.folder, int(state.round))
-        write_arrays(
-            self.folder / "acquisition.npz",
-            **acquisitions.acquisition_arrays(scene, self.initial, choices),
-        )
+        choices = load_choices(folder, int(state.round))
+        arrays = acquisition_arrays(scene, self.initial, choices)
+        write_arrays(folder / "acquisition.npz", **arrays)
         if completed:
-            acquisitions.write_next_views(
-                self.folder / "next_views" / "transforms.json", scene, choices
-            )
-        if not is_completed(read_json(path)):  # measured since, if it is
+            write_next_views(folder / "next_views" / "transforms.json", scene, choices)
+        if not files.is_completed(files.read_json(path)):  # measured since, if it is
             write_json(path, self._result(completed))
 
-    def _result(self, completed: bool) -> dict:
+    def _pictures(self, state: ActiveState) -> dict[str, np.ndarray]:
+        """Of test views, with uncertainty (Fig 4)."""
         scene = self.problem.scene
-        sizes = np.asarray(scene.cameras.sizes)
+        num_rays = int(num_training_pixels(scene, self.initial).sum())
+        known = (state.train, state.table, state.is_training_view, num_rays)
+        fns = self.problem.model_fns("laplace")
+        acquired = Acquired(*known, label=f"{self.label}: pictures")
+        fitted = fns.fit(stream_key(self.seed, "pictures"), acquired)
+        return evaluate.picture_arrays(
+            partial(fns.render, fitted, state.train),
+            scene,
+            evaluate.evenly_spaced(scene.test, self.config.num_pictures),
+            rays_per_pixel=self.config.rays_per_pixel,
+        )
+
+    def _result(self, completed: bool) -> dict:
+        scene, baselines = self.problem.scene, None
+        if completed:  # of the last round's test views; pictures taken on the way are left out
+            used = np.concatenate([row["selected"] for row in self.rounds]).astype(int)
+            test_views = evaluate.evenly_spaced(scene.test, self.config.num_test_final)
+            baselines = evaluate.measure_baselines(scene, used[used < scene.num_views], test_views)
         return {
             "schema_version": SCHEMA_VERSION,
             "scene": {
@@ -272,32 +241,26 @@ class Run:
                 "kind": self.config.loader,
                 "num_pool": len(scene.pool),
                 "num_test": len(scene.test),
-                "image_size": sizes.max(axis=0).tolist(),
+                "image_size": np.max(scene.cameras.sizes, axis=0).tolist(),
             },
             "policy": self.policy,
             "seed": self.seed,
             "command": self.command,
             "config": self.config.to_dict(),
-            "versions": versions(),
-            "device": device_name(),
+            "versions": runtime.versions(),
+            "device": runtime.device_name(),
             "num_devices": num_shards(self.problem.mesh),
-            "peak_memory_mb": peak_memory_mb(),
+            "peak_memory_mb": runtime.peak_memory_mb(),
             "completed": completed,
             "lpips_reason": self.problem.lpips_reason,
-            "baselines": self._baselines() if completed else None,
+            "baselines": baselines,
             "rounds": self.rounds,
         }
 
-    def _baselines(self) -> dict[str, float]:
-        """Of the last round's test views; pictures taken on the way are left out."""
-        scene = self.problem.scene
-        used = np.concatenate([row["selected"] for row in self.rounds]).astype(int)
-        test_views = evenly_spaced(scene.test, self.config.num_test_final)
-        return measure_baselines(scene, used[used < scene.num_views], test_views)
-
-    def _log(self, **values) -> None:
+    def _log(self, event: str, number: int, **values) -> None:
         head = {"time": time.time(), "policy": self.folder.parent.name, "seed": self.seed}
-        append_line(self.workdir / "metrics.jsonl", {**head, **values})
+        head |= {"event": event, "round": number}
+        files.append_line(self.workdir / "metrics.jsonl", head | values)
 
 
 def _new_pending() -> dict:
@@ -308,78 +271,180 @@ def _new_pending() -> dict:
 
 def saved_part(problem: Problem, state: ActiveState):
     """The state without the scene's own pixels, which its files hold already."""
-    first = int(problem.scene.offsets[-1])
-    return {
+    saved = {
         "train": state.train,
         "is_training_view": state.is_training_view,
         "round": state.round,
         "calls": state.calls,
         "restarts": state.restarts,
         "world_from_cam": state.table.cameras.world_from_cam,
-        **({"new_pixels": state.table.pixels[first:]} if problem.has_empty_views else {}),
-        **({"new_alpha": state.table.alpha[first:]} if problem.has_empty_views else {}),
     }
+    if problem.has_empty_views:
+        first, table = int(problem.scene.offsets[-1]), state.table
+        saved |= {"new_pixels": table.pixels[first:], "new_alpha": table.alpha[first:]}
+    return saved
 
 
 def whole_state(problem: Problem, saved) -> ActiveState:
     """The inverse of `saved_part`."""
-    table = problem.table
-    cameras = table.cameras.replace(world_from_cam=saved["world_from_cam"])
-    pixels, alpha = table.pixels, table.alpha
+    table, saved = problem.table, dict(saved)
+    cameras = table.cameras.replace(world_from_cam=saved.pop("world_from_cam"))
+    table = table.replace(cameras=cameras)
     if problem.has_empty_views:
-        pixels = pixels.at[int(problem.scene.offsets[-1]) :].set(saved["new_pixels"])
-        alpha = alpha.at[int(problem.scene.offsets[-1]) :].set(saved["new_alpha"])
-    return ActiveState(
-        train=saved["train"],
-        table=table.replace(cameras=cameras, pixels=pixels, alpha=alpha),
-        is_training_view=saved["is_training_view"],
-        round=saved["round"],
-        calls=saved["calls"],
-        restarts=saved["restarts"],
+        first = int(problem.scene.offsets[-1])
+        table = table.replace(
+            pixels=table.pixels.at[first:].set(saved.pop("new_pixels")),
+            alpha=table.alpha.at[first:].set(saved.pop("new_alpha")),
+        )
+    return ActiveState(table=table, **saved)
+
+
+# --- what was offered, scored and chosen: a file per round, written again if chosen again ---------
+
+
+def _choice_path(folder: pathlib.Path, number: int) -> pathlib.Path:
+    return folder / "choices" / f"round_{number}.npz"
+
+
+def save_choice(folder: pathlib.Path, number: int, choice: Choice, *, in_scene: bool) -> None:
+    """Writes the choice of round `number`, 1 for the first batch that was chosen.
+
+    `in_scene` tells whether candidates are views of the scene, or poses drawn freely.
+    """
+    cameras, info = choice.candidates.cameras, choice.selection
+    picked = jax.tree.map(np.asarray, take(cameras, choice.selected))
+    write_arrays(
+        _choice_path(folder, number),
+        positions=np.asarray(cameras.positions),
+        candidate_ids=choice.candidates.view_ids if in_scene else np.full(len(cameras), -1),
+        scores=info.scores,
+        survivors=info.survivors,
+        selected=choice.selected,
+        selected_scores=info.selected_scores,
+        nearest_training_distance=info.nearest_training_distance,
+        **{name: getattr(picked, name) for name in CAMERA_FIELDS},
     )
+
+
+def load_choices(folder: pathlib.Path, num_rounds: int) -> list[dict[str, np.ndarray]]:
+    """The choices of rounds 1 .. num_rounds; WorkdirError if one is missing or damaged."""
+    try:
+        return [load_arrays(_choice_path(folder, n)) for n in range(1, num_rounds + 1)]
+    except (FileNotFoundError, ValueError) as error:
+        raise WorkdirError(f"{error}: delete {folder} to run it anew") from error
+
+
+def acquisition_arrays(scene, initial, choices: list[dict]) -> dict[str, np.ndarray]:
+    """The arrays of `acquisition.npz`: all rounds over one numbering of views.
+
+    The scene's views come first; candidates that are not views of the scene follow.
+    """
+    positions, numbering = [np.asarray(scene.cameras.positions)], []
+    for choice in choices:
+        ids = choice["candidate_ids"]
+        if ids[0] < 0:
+            ids = sum(map(len, positions)) + np.arange(len(ids))
+            positions.append(choice["positions"])
+        numbering.append(ids)
+    num = sum(map(len, positions))
+    scores = np.full((len(choices), num), np.nan, np.float32)
+    survivors = np.zeros((len(choices), num), bool)
+    for row, (ids, choice) in enumerate(zip(numbering, choices)):
+        scores[row, ids], survivors[row, ids] = choice["scores"], choice["survivors"]
+    selected = [ids[choice["selected"]] for ids, choice in zip(numbering, choices)]
+    return {
+        "positions": np.concatenate(positions),
+        "up": np.asarray(scene.up, np.float32),
+        "centre": scene.centre,
+        "pool": np.asarray(scene.pool),
+        "scores": scores,
+        "survivors": survivors,
+        "selected": np.array(selected, np.int32).reshape(len(choices), -1 if choices else 0),
+        "initial": np.asarray(initial),
+        "names": np.array([*scene.names, *(f"pose {i}" for i in range(num - scene.num_views))]),
+    }
+
+
+def nerfstudio_frames(scene, cameras: Cameras) -> list[dict]:
+    """Cameras [k] of a scene as frames of a nerfstudio `transforms.json`, without names.
+
+    Poses are in the user's coordinates, intrinsics for the size of the scene's files.
+    """
+    cameras = photo_cameras(scene, cameras)
+    frames = []
+    for i, pose in enumerate(user_transforms(scene, cameras.world_from_cam)):
+        fx, fy, cx, cy = (float(x) for x in cameras.intrinsics[i])
+        width, height = (int(n) for n in cameras.sizes[i])
+        frame = {"transform_matrix": pose.tolist(), "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+        frame |= {"w": width, "h": height}
+        distortion = np.asarray(cameras.distortion[i], float).tolist()
+        frames.append(frame | dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), distortion)))
+    return frames
+
+
+def write_frames(path: pathlib.Path, scene, frames: list[dict]) -> None:
+    """Writes frames as a nerfstudio `transforms.json`."""
+    lens = "OPENCV_FISHEYE" if scene.cameras.lens == "fisheye" else "OPENCV"
+    write_json(path, {"camera_model": lens, "frames": frames})
+
+
+def write_next_views(path: pathlib.Path, scene, choices: list[dict]) -> None:
+    """Writes the chosen poses as a nerfstudio `transforms.json`, in the user's coordinates.
+
+    Frames come in the order of choosing; `round`, `rank` and `score` say when and why.
+    """
+    frames = []
+    for number, choice in enumerate(choices, start=1):
+        cameras = Cameras(**{name: choice[name] for name in CAMERA_FIELDS})
+        for rank, frame in enumerate(nerfstudio_frames(scene, cameras)):
+            view_id = int(choice["candidate_ids"][choice["selected"][rank]])
+            name = scene.names[view_id] if view_id >= 0 else f"next/{number}_{rank + 1}.png"
+            score = float(choice["selected_scores"][rank])
+            how = {"round": number, "rank": rank + 1, "score": score}
+            frames.append({"file_path": name, **frame, **how})
+    write_frames(path, scene, frames)
 
 
 # --- all runs of a config ---
 
 
-def make_parts(
-    config, folder: pathlib.Path, command: str, only: str | None = None, mesh: Mesh | None = None
+def run_all(
+    config, folder: pathlib.Path, command: str, mesh: Mesh | None = None, only: str | None = None
 ) -> None:
-    """Every policy with every seed, each from the round 0 it shares; or only one part of that."""
-    parts = all_parts(config.policies, config.seeds)
-    if only is not None:
-        parts = [find_part(only, parts)]
-    workdir.check_claim(folder, config)
+    """Every policy with every seed, each from the round 0 it shares; then views and report.
+
+    `command` is kept in the result files. `only` names a part, such as `bavs/seed_0`, to make just
+    that.
+    """
+    start = time.monotonic()
+    known = {part.name: part for part in files.all_parts(config.policies, config.seeds)}
+    if only is not None and only not in known:
+        raise ConfigError(f"--part: {only!r} is not part of this config; use one of {(*known,)}")
+    parts = [*known.values()] if only is None else [known[only]]
+    files.check_claim(folder, config)
     scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     check_views(config, scene)
     print(f"{scene.name}: {len(scene.pool)} views to choose from, {len(scene.test)} test views")
-    problems = {kind: build_problem(config, scene, kind, mesh) for kind in {p.kind for p in parts}}
-    workdir.claim(folder, config)
+    problems = {kind: Problem(config, scene, kind, mesh) for kind in {p.kind for p in parts}}
+    files.claim(folder, config)
 
-    def make(part, shared=None) -> Run:
+    def make(part: Part, shared: Run | None = None) -> Run:
         # Other processes may make other parts of the same folder, and need the same round 0.
-        with exclusive(folder / part.name):
+        with files.exclusive(folder / part.name):
             run = Run(config, problems[part.kind], folder, part.policy, part.seed, command)
             run.finish(shared)
             return run
 
-    first_rounds = {}
+    first_rounds: dict[Part, Run] = {}
     for part in parts:
         if part.initial not in first_rounds:
             first_rounds[part.initial] = make(part.initial)
         if part.policy is not None:
             make(part, first_rounds[part.initial])
             if only is None and is_first_process():
-                workdir.collect(folder)
-
-
-def run_all(config, folder: pathlib.Path, command: str, mesh: Mesh | None) -> None:
-    """All parts of a config, then the exported views and the report."""
-    start = time.monotonic()
-    make_parts(config, folder, command, mesh=mesh)
-    if not is_first_process():
-        return
-    next_views = workdir.export_next_views(folder, config.policies[0], config.seeds[0])
-    report = write_report(folder)
-    print(f"chosen poses: {next_views}")
-    print(f"report:       {report}  ({time.monotonic() - start:.0f} s in all)")
+                files.collect(folder)
+    if only is None and is_first_process():
+        next_views = files.export_next_views(folder, config.policies[0], config.seeds[0])
+        print(f"chosen poses: {next_views}")
+        report = write_report(folder)
+        print(f"report:       {report}  ({time.monotonic() - start:.0f} s in all)")

@@ -1,7 +1,8 @@
-"""What the process of a script needs: flags, caches, one-line errors, and what it runs on."""
+"""What every script needs: errors in one line, flags, caches, progress, and what it runs on."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.metadata
 import math
@@ -9,48 +10,195 @@ import os
 import pathlib
 import platform
 import resource
+import socket
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
 
 import jax
+import numpy as np
 from absl import app, flags, logging
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
+from bavs_jax.devices import make_mesh
+from bavs_jax.export.formats import ExportError
+from bavs_jax.placement.collect import PlacementError
+from bavs_jax.scenes import SceneError
 from bavs_jax.scenes.base import printable
-from experiments import signals
-from experiments.errors import USER_ERRORS, ConfigError, one_line, shown
+from bavs_jax.selection import SelectionError
+from experiments import handle_signals, stop
 
 PACKAGES = ("bavs_jax", "jax", "jaxlib", "flax", "optax", "numpy")
+PLAIN_INTERVAL = 10.0  # seconds between two lines of progress where there is no terminal
 FLAGS = flags.FLAGS
 flags.disclaim_key_flags()  # flags that are defined here are those of the module that asks for them
+
+# --- errors ----------------------------------------------------------------------------------
+
+
+class ConfigError(ValueError):
+    """An option that cannot be used: one line that names it and the fix."""
+
+
+class WorkdirError(ValueError):
+    """A folder that cannot be used: one line that names the file, the field and the fix."""
+
+
+class ReportError(ValueError):
+    """A file that cannot be used: one line that names the file, the field and the fix."""
+
+
+# What a script prints in place of a traceback. FloatingPointError is a loss that is not finite.
+USER_ERRORS = (
+    *(ConfigError, WorkdirError, ReportError, FloatingPointError, OSError),
+    *(SceneError, SelectionError, PlacementError, ExportError),
+)
+
+
+def shown(value) -> str:
+    """A value that a user gave, in one short line of characters that can be printed."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python refuses to write out a number of thousands of digits
+        return f"a number of {value.bit_length():,} bits"
+    return text if len(text) <= 80 else f"{text[:60]}... ({len(text):,} characters)"
+
+
+def one_line(error: Exception) -> str:
+    """An error in one line: of a traceback, where it began and what went wrong."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return " ".join(dict.fromkeys([lines[0], lines[-1]])) if lines else type(error).__name__
+
+
+def reason(error: Exception) -> str:
+    """What was wrong, without the name of the file that an OSError repeats."""
+    return getattr(error, "strerror", None) or str(error)
+
+
+@functools.cache
+def warn(text: str) -> None:
+    """A line on standard error, for what goes on all the same; said once."""
+    print(f"warning: {text}", file=sys.stderr, flush=True)
+
+
+# --- a script's start and end ----------------------------------------------------------------
+
+
+def run_script(main: Callable[[], None]) -> None:
+    """Runs a script's `main()` after reading its flags; what goes wrong ends in one line.
+
+    So do ctrl-C and SIGTERM, with the exit codes that shells give for them.
+    """
+    received = []
+
+    def interrupt(number, frame):
+        if received:
+            stop(number)
+        received.append(number)
+        raise KeyboardInterrupt
+
+    def parse(argv):
+        try:
+            left = FLAGS(argv)
+        except flags.Error as error:
+            sys.exit(f"error: {one_line(error)}; --help explains every flag")
+        except Exception as error:  # a config file is a program: it can raise anything
+            sys.exit(
+                "error: --config: no such option or file, or a value of another type: "
+                f"{one_line(error)}"
+            )
+        for name, value in FLAGS.flag_values_dict().items():  # no bounds of a flag catch a NaN
+            if isinstance(value, float) and not math.isfinite(value):
+                sys.exit(f"error: --{name}: is {value}; give a finite number")
+        return left
+
+    def without_arguments(argv):
+        if len(argv) > 1:
+            sys.exit(f"error: unknown argument {argv[1]!r}; options are given as --name=value")
+        # Checkpoint libraries report every write at INFO; warnings and errors still show.
+        logging.set_verbosity(logging.WARNING)
+        handle_signals(interrupt)
+        try:
+            main()
+        except BaseException as error:
+            if received:  # libraries may make another error of the interrupt
+                stop(received[0])
+            if isinstance(error, USER_ERRORS):
+                sys.exit(f"error: {' '.join(str(error).split())}")
+            raise
+
+    app.run(without_arguments, flags_parser=parse)
+
+
+def command_line() -> str:
+    """The command as a user would type it."""
+    module = sys.modules["__main__"].__spec__
+    name = f"python -m {module.name}" if module else f"python {sys.argv[0]}"
+    return " ".join([name, *sys.argv[1:]])
+
+
+def end_with_parent() -> None:
+    """Ends this process as soon as its standard input is closed.
+
+    A program that starts this one through a pipe takes it along even when it is killed.
+    """
+
+    def watch():
+        while os.read(sys.stdin.fileno(), 1024):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def given_folder(flag: str, hint: str, *, exists: bool = False) -> pathlib.Path:
+    """The folder that a flag names, which can be made or, if it `exists` already, read.
+
+    Raises ConfigError with a `hint` of what to name if it cannot be used.
+    """
+    text = FLAGS[flag].value
+    if not text:
+        raise ConfigError(f"--{flag}: is missing; name {hint}")
+    path = pathlib.Path(text)
+    try:
+        if "\0" in text:  # `Path.exists` says no more than that there is none
+            raise ValueError("embedded null byte")
+        found = path if exists else next(p for p in (path, *path.parents) if p.exists())
+        os.scandir(found).close()
+        if not exists and not os.access(found, os.W_OK | os.X_OK):
+            raise PermissionError(f"no permission to write into {found}")
+    except (OSError, ValueError) as error:
+        why = f"{shown(text)} cannot be used ({reason(error)})"
+        raise ConfigError(f"--{flag}: {why}; name {hint}") from None
+    return path
+
 
 # --- caches ----------------------------------------------------------------------------------
 
 
-def cache_folder() -> pathlib.Path | None:
-    """Where scenes and compiled programs are kept: in `$XDG_CACHE_HOME` or `~/.cache`.
+def cache_folder(given: str = "") -> pathlib.Path | None:
+    """Where scenes and compiled programs are kept: `given`, or `bavs_jax` in the user's cache.
 
-    None, after a warning, where nothing can be.
+    It is there; None, after a warning, if nothing can be written to it.
     """
-    root = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    root = given or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     try:
-        return usable_cache(pathlib.Path(root).expanduser() / "bavs_jax")
-    except RuntimeError as error:  # nobody's home
-        warn(f"{root}: {error}: goes on without a cache; set XDG_CACHE_HOME to have one")
-        return None
-
-
-def usable_cache(folder: pathlib.Path) -> pathlib.Path | None:
-    """The folder, made if it is not there; None, after a warning, if nothing can be written."""
-    try:
+        folder = pathlib.Path(root).expanduser() / ("" if given else "bavs_jax")
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(4096))
-    except (OSError, ValueError) as error:  # or a name that no folder can have
-        why = getattr(error, "strerror", None) or error
-        warn(f"{printable(str(folder))}: cannot be used ({why}): goes on without a cache there")
+    except (OSError, ValueError, RuntimeError) as error:  # the last: a user without a home
+        warn(
+            f"{printable(root)}: cannot be used ({reason(error)}): goes on without a cache; set "
+            "XDG_CACHE_HOME or --compilation_cache_dir to have one"
+        )
         return None
     return folder
 
@@ -80,121 +228,164 @@ def define_cache_flags() -> None:
 
 def start_cache() -> None:
     """Does what the flags of the cache say; must come before anything is compiled."""
-    if FLAGS.compilation_cache:
-        given = FLAGS.compilation_cache_dir
-        root = usable_cache(pathlib.Path(given)) if given else cache_folder()
-        if root is not None:
-            use_compilation_cache(root if given else root / "compiled")
-
-
-def cache_flags() -> list[str]:
-    """The flags of the cache for another process."""
     given = FLAGS.compilation_cache_dir
-    directory = [f"--compilation_cache_dir={given}"] if given else []
-    return [f"--compilation_cache={FLAGS.compilation_cache}", *directory]
+    folder = cache_folder(given) if FLAGS.compilation_cache else None
+    if folder is not None:
+        use_compilation_cache(folder if given else folder / "compiled")
 
 
-# --- a script's start and end ----------------------------------------------------------------
+# --- devices and processes -------------------------------------------------------------------
 
 
-@functools.cache
-def warn(text: str) -> None:
-    """A line on standard error, for what goes on all the same; said once."""
-    print(f"warning: {text}", file=sys.stderr, flush=True)
+def is_first_process() -> bool:
+    """Whether this process is the one that writes files."""
+    return not jax.distributed.is_initialized() or jax.process_index() == 0
 
 
-def command_line() -> str:
-    """The command as a user would type it."""
-    module = sys.modules["__main__"].__spec__
-    name = f"python -m {module.name}" if module else f"python {sys.argv[0]}"
-    return " ".join([name, *sys.argv[1:]])
+def as_first_process(value: bool) -> bool:
+    """What the first process says, so that all do the same where clocks or files differ."""
+    if not jax.distributed.is_initialized():
+        return value
+    return bool(multihost_utils.broadcast_one_to_all(np.array(value)))
 
 
-def end_with_parent() -> None:
-    """Ends this process as soon as its standard input is closed.
+def define_device_flags() -> None:
+    """Gives a script the flags of `start_devices`."""
+    of_first = "With --coordinator: "
+    flags.DEFINE_integer("devices", 1, "Devices that share the rays of a run; 0: all.", 0)
+    flags.DEFINE_string(
+        "coordinator", "", "host:port of the first of several processes; they use all devices."
+    )
+    flags.DEFINE_integer("num_processes", 1, f"{of_first}how many processes there are.", 1)
+    flags.DEFINE_integer("process_id", 0, f"{of_first}which one this is, from 0 on.", 0)
+    flags.DEFINE_integer("join_seconds", 300, f"{of_first}how long to wait for all.", 1, 86400)
 
-    A program that starts this one through a pipe need do nothing more to take it along when it
-    is killed; what is lost is what a kill of this process loses.
+
+def start_devices() -> Mesh | None:
+    """Joins the other processes, says which devices are used, and makes their mesh.
+
+    With `--coordinator` the same command is started once for each process, on machines that share
+    the working folder: all of them compute, the first one prints and writes. Must come before
+    anything is computed. Raises ConfigError for flags that cannot be used.
     """
+    if not FLAGS.coordinator and FLAGS.num_processes != 1:
+        raise ConfigError("--num_processes: needs --coordinator, the host:port of the first one")
+    if FLAGS.coordinator:
+        _join_processes(FLAGS.coordinator, FLAGS.num_processes, FLAGS.process_id)
+    try:
+        mesh = make_mesh(0 if FLAGS.coordinator else FLAGS.devices)
+    except ValueError as error:
+        raise ConfigError(
+            f"--devices: {error}; on a CPU, XLA_FLAGS=--xla_force_host_platform_device_count=N "
+            "makes N of them"
+        ) from None
+    devices = jax.devices()[:1] if mesh is None else mesh.devices.ravel().tolist()
+    kinds = Counter(device.device_kind for device in devices)
+    of = f", of {FLAGS.num_processes} processes" if FLAGS.num_processes > 1 else ""
+    print(f"devices: {', '.join(f'{num} x {kind}' for kind, num in kinds.items())}{of}")
+    return mesh
 
-    def watch():
-        while os.read(sys.stdin.fileno(), 1024):
-            pass
+
+def _join_processes(address: str, num: int, number: int) -> None:
+    if not 0 <= number < num:
+        raise ConfigError(
+            f"--process_id: {number} is not below --num_processes, {num}; number them from 0 on"
+        )
+    host, _, port = address.rpartition(":")
+    try:
+        if not host or not 0 < int(port) < 65536:
+            raise ValueError
+        socket.getaddrinfo(host.strip("[]"), int(port))
+    except (ValueError, OSError):
+        raise ConfigError(
+            f"--coordinator: {shown(address)} is no host:port that is known here; give that of the "
+            "first process, such as 10.0.0.1:1234"
+        ) from None
+
+    def give_up():  # before JAX does, which dumps its stack
+        reason = f"after {FLAGS.join_seconds} s not all {num} processes have met at {address}"
+        print(f"error: --coordinator: {reason}", file=sys.stderr, flush=True)
         os._exit(1)
 
-    threading.Thread(target=watch, daemon=True).start()
+    timer = threading.Timer(FLAGS.join_seconds, give_up)
+    timer.daemon = True
+    timer.start()
+    patience = FLAGS.join_seconds + 60
+    jax.distributed.initialize(address, num, number, initialization_timeout=patience)
+    timer.cancel()
+    if number > 0:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, open as long as the process is
 
 
-def given_folder(flag: str, hint: str, *, exists: bool = False) -> pathlib.Path:
-    """The folder that a flag names, which can be made or, if it `exists` already, read.
+# --- progress --------------------------------------------------------------------------------
 
-    Raises:
-      ConfigError: there is no name, or none of a folder that can be used.
+
+class Task:
+    """What `track` hands out: counts what is done; its text says how far and how fast that is."""
+
+    def __init__(self, total: int, unit: str, clock: Callable[[], float]):
+        self.total, self.unit, self.clock = total, unit, clock
+        self.done, self.numbers, self.start = 0, {}, clock()
+        self.on_advance: Callable[[int], None] = lambda n: None
+
+    def advance(self, n: int = 1, **numbers: float) -> None:
+        """Counts `n` more units as done and shows `numbers` until they are given again."""
+        self.done += n
+        self.numbers = {**self.numbers, **numbers}  # a new dict: the bar's own thread reads it
+        self.on_advance(n)
+
+    def __str__(self) -> str:
+        """Rate, elapsed and remaining time, and the current numbers."""
+        elapsed = self.clock() - self.start
+        parts = [f"{elapsed:.0f} s elapsed"]
+        if self.done and elapsed > 0:
+            rate = self.done / elapsed
+            remaining = max(self.total - self.done, 0) / rate
+            parts = [f"{rate:.3g} {self.unit}/s", *parts, f"{remaining:.0f} s remaining"]
+        return ", ".join(parts + [f"{name} {float(x):.4g}" for name, x in self.numbers.items()])
+
+
+@contextlib.contextmanager
+def track(
+    total: int, description: str, unit: str = "steps", *, stream=None, clock=time.monotonic
+) -> Iterator[Task]:
+    """Shows how far a piece of work is, how fast it goes and when it will end.
+
+    It has `total` units. On a terminal there is a bar, elsewhere a line every `PLAIN_INTERVAL`
+    seconds and at the end. The library never imports this: scripts pass it on as a callback.
+
+    Yields:
+      A `Task`; call its `advance(n, loss=loss)` as the work goes on.
     """
-    text = FLAGS[flag].value
-    if not text:
-        raise ConfigError(f"--{flag}: is missing; name {hint}")
-    path, why = pathlib.Path(text), None
+    stream = sys.stdout if stream is None else stream
+    task = Task(total, unit, clock)
+    if stream.isatty():
+        # The last column is made when the bar is redrawn: a number may still be on its way from
+        # the device, and reading it at every step would wait for it.
+        words = TextColumn("{task.fields[own]}", markup=False)
+        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), words
+        with Progress(*columns, console=Console(file=stream)) as bar:
+            number = bar.add_task(description, total=total, own=task)
+            task.on_advance = lambda n: bar.advance(number, n)
+            yield task
+        return
+    shown_at = task.start
+
+    def write_line() -> None:
+        print(f"{description}: {task.done}/{total} {unit}, {task}", file=stream, flush=True)
+
+    def write_sometimes(n: int) -> None:
+        nonlocal shown_at
+        # The last unit is left to the line that closes the task.
+        if clock() - shown_at >= PLAIN_INTERVAL and task.done < total:
+            shown_at = clock()
+            write_line()
+
+    task.on_advance = write_sometimes
     try:
-        if "\0" in text:  # `Path.exists` says no more than that there is none
-            raise ValueError("embedded null byte")
-        found = path if exists else next(p for p in (path, *path.parents) if p.exists())
-        if not found.is_dir():
-            why = f"{shown(str(found))} " + ("is no folder" if found.exists() else "does not exist")
-    except (OSError, ValueError) as error:  # a name that no file can have
-        why = f"{shown(text)} cannot be used ({error})"
-    if why:
-        raise ConfigError(f"--{flag}: {why}; name {hint}")
-    if not os.access(found, os.R_OK | os.X_OK if exists else os.W_OK | os.X_OK):
-        raise ConfigError(f"--{flag}: {found}: no permission; name {hint}")
-    return path
-
-
-def check_finite() -> None:
-    """Raises ConfigError for a flag whose number is not finite, which no bounds of a flag catch."""
-    for name, value in FLAGS.flag_values_dict().items():
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ConfigError(f"--{name}: is {value}; give a finite number")
-
-
-def run_script(main: Callable[[], None]) -> None:
-    """Runs a script's `main()` after reading its flags; what goes wrong ends in one line.
-
-    So do ctrl-C and SIGTERM, with the exit codes that shells give for them.
-    """
-
-    def parse(argv):
-        try:
-            left = FLAGS(argv)
-            check_finite()
-            return left
-        except flags.Error as error:
-            sys.exit(f"error: {one_line(error)}; --help explains every flag")
-        except ConfigError as error:
-            sys.exit(f"error: {error}")
-        except Exception as error:  # a config file is a program: it can raise anything
-            sys.exit(
-                "error: --config: no such option or file, or a value of another type: "
-                f"{one_line(error)}"
-            )
-
-    def without_arguments(argv):
-        if len(argv) > 1:
-            sys.exit(f"error: unknown argument {argv[1]!r}; options are given as --name=value")
-        # Checkpoint libraries report every write at INFO; warnings and errors still show.
-        logging.set_verbosity(logging.WARNING)
-        signals.interrupt_work()
-        try:
-            main()
-        except BaseException as error:
-            # Libraries may make another error of the interrupt.
-            if number := signals.received():
-                signals.end(number)
-            if isinstance(error, (*USER_ERRORS, OSError)):
-                sys.exit(f"error: {' '.join(str(error).split())}")
-            raise
-
-    app.run(without_arguments, flags_parser=parse)
+        yield task
+    finally:
+        write_line()
 
 
 # --- what a result was made on ---------------------------------------------------------------

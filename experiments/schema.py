@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 from absl import flags
@@ -20,8 +21,9 @@ from bavs_jax.uncertainty.channel import EXTENTS, SCALES, VARIANTS
 from bavs_jax.uncertainty.conformal_scale import SCALES as INTERVAL_SCALES
 from bavs_jax.uncertainty.curvature import WEIGHTINGS
 from bavs_jax.uncertainty.models import MODELS
-from experiments.build_field import SAMPLERS
-from experiments.errors import ConfigError, one_line, shown
+from experiments.build_model import SAMPLERS
+from experiments.files import leaves
+from experiments.runtime import ConfigError, one_line, shown
 
 MAX_SEED = 2**32 - 1  # a larger one is the key of another seed, or none
 MAX_WIDTH = 8192  # pixels of an image
@@ -29,6 +31,8 @@ MAX_COUNT = 10**9
 MAX_VALUE = 1e9  # of a number without a natural bound; above it float32 loses what is added
 MAX_LOG2_CELLS = 9
 GRID_MEMORY = "a grid of 2^9 cells per side takes 1.6 GB for each view's curvature, 2^10 13 GB"
+
+# --- kinds of options ------------------------------------------------------------------------
 
 
 class Option(NamedTuple):
@@ -38,31 +42,28 @@ class Option(NamedTuple):
     fits: Callable  # value -> bool
 
 
-def whole(low: int, high: int, zero: str = "", *, note: str = "") -> Option:
-    """A whole number, and 0 where it has a meaning of its own; the `note` says what limits it."""
-    words = f"a whole number from {low:,} to {high:,}" + (f", or 0: {zero}" if zero else "")
-    words += f" ({note})" if note else ""
-    return Option(words, lambda x: type(x) is int and (low <= x <= high or (x == 0 and bool(zero))))
+def number(low, high, zero: str = "", *, types=(int, float), above=False, note="") -> Option:
+    """A finite number, and 0 where that has a meaning of its own.
 
-
-def number(low: float, high: float, zero: str = "", *, open_low=False, open_high=False) -> Option:
-    """A finite number; `open_*` leaves its end out."""
-    words = f"a number {'above' if open_low else 'from'} {low:g}"
-    words += f" {'below' if open_high else 'to'} {high:g}" + (f", or 0: {zero}" if zero else "")
+    `above` leaves the low end out; the `note` says what limits the number.
+    """
+    form = "," if types == (int,) else "g"
+    words = "a whole number" if types == (int,) else "a number"
+    words += f" {'above' if above else 'from'} {low:{form}} to {high:{form}}"
+    words += (f", or 0: {zero}" if zero else "") + (f" ({note})" if note else "")
 
     def fits(value):
-        if type(value) not in (int, float):
+        if type(value) not in types:
             return False
-        above = value > low if open_low else value >= low
-        below = value < high if open_high else value <= high
-        return (above and below) or (value == 0.0 and bool(zero))
+        inside = low < value <= high if above else low <= value <= high
+        return inside or (value == 0 and bool(zero))
 
     return Option(words, fits)
 
 
-def positive(high: float, zero: str = "") -> Option:
-    """A number above 0."""
-    return number(0.0, high, zero, open_low=True)
+whole = partial(number, types=(int,))
+positive = partial(number, 0.0, above=True)
+views = partial(whole, 1, 100_000)
 
 
 def choice(*known: str) -> Option:
@@ -73,24 +74,19 @@ def choice(*known: str) -> Option:
 
 def several(item: Option, least: int, most: int, *, distinct: bool = True) -> Option:
     """A tuple of things."""
-    once = ", each once" if distinct else ""
 
     def fits(values):
         if type(values) is not tuple or not least <= len(values) <= most:
             return False
         return all(map(item.fits, values)) and (not distinct or len({*values}) == len(values))
 
+    once = ", each once" if distinct else ""
     return Option(f"a tuple of {least:,} to {most:,}{once}: {item.wanted}", fits)
-
-
-def views(zero: str = "") -> Option:
-    """A count of views."""
-    return whole(1, 100_000, zero)
 
 
 def _is_seed_text(value) -> bool:
     digits = type(value) is str and re.fullmatch("[0-9]{1,10}", value)
-    return bool(digits) and int(value) <= MAX_SEED
+    return value == "" or (bool(digits) and int(value) <= MAX_SEED)
 
 
 def _is_pool_size(value) -> bool:
@@ -103,155 +99,101 @@ TEXT = Option(
     "up to 1,000 characters that can be printed",
     lambda value: type(value) is str and len(value) <= 1000 and value.isprintable(),
 )
-RAYS_PER_PIXEL = Option("1, 4 or 9", lambda value: type(value) is int and value in (1, 4, 9))
 SEED = whole(0, MAX_SEED)
-SEED_TEXT = Option(
-    f"a whole number from 0 to {MAX_SEED:,} as text, or '': each seed its own",
-    lambda value: value == "" or _is_seed_text(value),
-)
-POOL_SIZE = Option(
-    "a share above 0 and below 1, a whole count up to 100000, or 0: as the loader sees fit",
-    _is_pool_size,
-)
-WEIGHT = number(0.0, 1e6)
-LAYERS, WIDTH, SAMPLES, RESOLUTION = whole(1, 64), whole(1, 4096), whole(1, 4096), whole(1, 65536)
-LEVELS, DEGREE, SKIP, DRAWS = whole(1, 32), whole(1, 24), whole(0, 64), whole(2, 1024)
-TABLE = whole(1, 24)  # 16 million rows
+COUNT = whole(1, MAX_COUNT, "all")
+BELOW_1 = Option("a number from 0 to below 1", lambda x: type(x) in (int, float) and 0 <= x < 1)
 AUSE_VARIANTS = [
     variant_name(of=of, error=error, pooled=pooled)
     for of, error, pooled in itertools.product(("colour", "depth"), ERRORS, (False, True))
 ]
 
-SCHEMA = {
+# --- the options -----------------------------------------------------------------------------
+
+_OPTIONS_OF_A_KIND = {
+    "load.strict from_scratch train.random_background evaluation.scale_depth": FLAG,
+    "data_dir scene": TEXT,
+    # words
     "loader": choice(*LOADERS, "auto"),
-    "data_dir": TEXT,
-    "scene": TEXT,
-    "image_size": whole(1, MAX_WIDTH, "as the files are"),
-    "load.strict": FLAG,
-    "load.downscale": whole(1, 1024, "as the loader sees fit"),
-    "load.pool_size": POOL_SIZE,
-    "load.test_every": whole(2, 100_000, "as the loader sees fit"),
-    "load.seed": SEED,
     "load.split": choice("", *SPLITS),
-    "policies": several(choice(*POLICIES), 1, len(POLICIES)),
-    "seeds": several(SEED, 1, 10_000),
-    "num_initial": views("all of the pool"),
-    "view_seed": SEED_TEXT,
-    "batch_size": views(),
-    "num_rounds": whole(0, 10_000),
-    "from_scratch": FLAG,
-    "num_test": views("all"),
-    "num_test_final": views("all"),
-    "num_pictures": views("all"),
     "lpips_net": choice("", *NETS),
-    "checkpoint_seconds": number(0.0, MAX_VALUE),
     "field_kind": choice(*SAMPLERS),
     "sampler_kind": choice("", *sorted({*itertools.chain(*SAMPLERS.values())})),
-    "rays_per_pixel": RAYS_PER_PIXEL,
-    "hash_grid.num_levels": LEVELS,
-    "hash_grid.coarsest": RESOLUTION,
-    "hash_grid.finest": RESOLUTION,
-    "hash_grid.features": whole(1, 64),
-    "hash_grid.log2_table_size": TABLE,
-    "hash_grid.width": WIDTH,
-    "hash_grid.geometry_features": WIDTH,
-    "hash_grid.initial_optical_depth": number(1e-6, 1e3),
-    "hash_grid.direction_degree": whole(1, 4),
-    "hash_grid.appearance_features": whole(1, 1024, "none"),
-    "nerf_mlp.depth": LAYERS,
-    "nerf_mlp.width": WIDTH,
-    "nerf_mlp.skip": SKIP,
-    "nerf_mlp.position_degree": DEGREE,
-    "nerf_mlp.direction_degree": DEGREE,
-    "mip_mlp.depth": LAYERS,
-    "mip_mlp.width": WIDTH,
-    "mip_mlp.skip": SKIP,
-    "mip_mlp.position_degree": DEGREE,
-    "mip_mlp.direction_degree": DEGREE,
-    "mip_mlp.proposal_depth": LAYERS,
-    "mip_mlp.proposal_width": WIDTH,
-    "flow.condition_features": WIDTH,
-    "flow.num_flows": LAYERS,
-    "flow_training.num_draws": DRAWS,
-    "flow_training.entropy_weight": WEIGHT,
-    "flow_training.floor": positive(1e3),
-    "coarse_to_fine.num_coarse": SAMPLES,
-    "coarse_to_fine.num_fine": SAMPLES,
-    "march.num_steps": whole(1, 65536),
-    "march.num_slots": SAMPLES,
-    "march.occupancy_resolution": whole(1, 512),
-    "proposal.num_proposals": several(SAMPLES, 1, 8, distinct=False),
-    "proposal.num_samples": SAMPLES,
-    "proposal.far": positive(MAX_VALUE),
-    "proposal.num_levels": LEVELS,
-    "proposal.coarsest": RESOLUTION,
-    "proposal.finest": several(RESOLUTION, 1, 8, distinct=False),
-    "proposal.log2_table_size": TABLE,
-    "proposal.width": WIDTH,
-    "proposal.anneal_steps": whole(0, MAX_COUNT),
-    "proposal.interlevel_weight": WEIGHT,
-    "proposal.distortion_weight": WEIGHT,
-    "proposal.penalty_weight": WEIGHT,
-    "train.num_steps": whole(1, 10_000_000),
-    "train.num_rays": whole(1, 1 << 20),
-    "train.capacity": whole(1, 1 << 24),
-    "train.one_ray_share": number(0.0, 1.0),
-    "train.look_ahead": whole(0, 64),
-    "train.learning_rate": positive(1.0, "what suits the field kind"),
-    "train.final_share": positive(1.0),
-    "train.warmup_steps": whole(0, 10_000_000),
-    "train.max_grad_norm": positive(MAX_VALUE, "never cut"),
-    "train.adam_b2": number(0.0, 1.0, open_high=True),
-    "train.adam_eps": positive(1.0),
-    "train.penalty_weight": WEIGHT,
-    "train.roughness_weight": number(0.0, MAX_VALUE),
-    "train.average_age": positive(0.5, "the last parameters"),
-    "train.random_background": FLAG,
-    "train.steps_per_call": whole(1, 100_000),
-    "uncertainty.log2_cells": whole(1, MAX_LOG2_CELLS, note=GRID_MEMORY),
-    "uncertainty.prior_weight": positive(1e6, "1e-4 / (2^L)^3"),
     "uncertainty.weighting": choice(*WEIGHTINGS),
     "uncertainty.variant": choice(*VARIANTS),
     "uncertainty.scale": choice(*SCALES),
     "uncertainty.extent": choice(*EXTENTS),
-    "uncertainty.offset_cells": positive(1e3),
-    "uncertainty.flow_draws": DRAWS,
-    "uncertainty.ensemble_size": whole(2, 64),
-    "uncertainty.max_rays": whole(1, MAX_COUNT, "all"),
-    "evaluation.models": several(choice(*MODELS), 1, len(MODELS)),
-    "evaluation.num_views": views("all"),
-    "evaluation.scale_depth": FLAG,
     "evaluation.variant": choice(*AUSE_VARIANTS),
-    "evaluation.num_interval_views": views("all"),
-    "evaluation.num_interval_pixels": whole(1, MAX_COUNT, "all"),
     "evaluation.interval_scale": choice(*INTERVAL_SCALES),
     "candidates.source": choice("dataset", "hemisphere"),
-    "candidates.hemisphere_draws": views(),
-    "candidates.image_scale": positive(1.0),
     "candidates.mode": choice("", *MODES),
-    "candidates.min_train_distance": number(0.0, MAX_VALUE),
-    "candidates.min_candidate_distance": number(0.0, MAX_VALUE),
+    "view_seed": Option(f"{SEED.wanted} as text, or '': each seed its own", _is_seed_text),
+    # tuples
+    "policies": several(choice(*POLICIES), 1, len(POLICIES)),
+    "seeds": several(SEED, 1, 10_000),
+    "evaluation.models": several(choice(*MODELS), 1, len(MODELS)),
+    "proposal.num_proposals": several(whole(1, 4096), 1, 8, distinct=False),
+    "proposal.finest": several(whole(1, 65536), 1, 8, distinct=False),
+    # counts of views, pixels and steps
+    "load.pool_size": Option(
+        "a share above 0 and below 1, a whole count up to 100000, or 0: as the loader sees fit",
+        _is_pool_size,
+    ),
+    "load.test_every": whole(2, 100_000, "as the loader sees fit"),
+    "load.downscale": whole(1, 1024, "as the loader sees fit"),
+    "load.seed": SEED,
+    "image_size": whole(1, MAX_WIDTH, "as the files are"),
+    "num_initial": views("all of the pool"),
+    "batch_size candidates.hemisphere_draws": views(),
+    "num_rounds": whole(0, 10_000),
+    "num_test num_test_final num_pictures": views("all"),
+    "evaluation.num_views evaluation.num_interval_views": views("all"),
+    "evaluation.num_interval_pixels uncertainty.max_rays": COUNT,
+    "rays_per_pixel": Option("1, 4 or 9", lambda x: type(x) is int and x in (1, 4, 9)),
+    "train.num_rays": whole(1, 1 << 20),
+    "train.capacity": whole(1, 1 << 24),
+    "train.num_steps": whole(1, 10_000_000),
+    "train.warmup_steps": whole(0, 10_000_000),
+    "train.steps_per_call": whole(1, 100_000),
+    "train.look_ahead nerf_mlp.skip mip_mlp.skip": whole(0, 64),
+    "proposal.anneal_steps": whole(0, MAX_COUNT),
+    # sizes of fields and samplers
+    "hash_grid.num_levels proposal.num_levels": whole(1, 32),
+    "hash_grid.coarsest hash_grid.finest proposal.coarsest march.num_steps": whole(1, 65536),
+    "hash_grid.log2_table_size proposal.log2_table_size": whole(1, 24),  # 16 million rows
+    "hash_grid.features hash_grid.geometry_features": whole(1, 4096),
+    "hash_grid.width nerf_mlp.width mip_mlp.width mip_mlp.proposal_width": whole(1, 4096),
+    "proposal.width flow.condition_features march.num_slots": whole(1, 4096),
+    "coarse_to_fine.num_coarse coarse_to_fine.num_fine proposal.num_samples": whole(1, 4096),
+    "hash_grid.direction_degree": whole(1, 4),
+    "hash_grid.appearance_features": whole(1, 1024, "none"),
+    "nerf_mlp.depth mip_mlp.depth mip_mlp.proposal_depth flow.num_flows": whole(1, 64),
+    "nerf_mlp.position_degree nerf_mlp.direction_degree": whole(1, 24),
+    "mip_mlp.position_degree mip_mlp.direction_degree": whole(1, 24),
+    "flow_training.num_draws uncertainty.flow_draws": whole(2, 1024),
+    "march.occupancy_resolution": whole(1, 512),
+    "uncertainty.log2_cells": whole(1, MAX_LOG2_CELLS, note=GRID_MEMORY),
+    "uncertainty.ensemble_size": whole(2, 64),
+    # numbers
+    "checkpoint_seconds train.roughness_weight": number(0.0, MAX_VALUE),
+    "candidates.min_train_distance candidates.min_candidate_distance": number(0.0, MAX_VALUE),
+    "candidates.image_scale train.final_share train.adam_eps": positive(1.0),
+    "hash_grid.initial_optical_depth": number(1e-6, 1e3),
+    "flow_training.entropy_weight train.penalty_weight": number(0.0, 1e6),
+    "proposal.interlevel_weight proposal.distortion_weight": number(0.0, 1e6),
+    "proposal.penalty_weight": number(0.0, 1e6),
+    "flow_training.floor uncertainty.offset_cells": positive(1e3),
+    "proposal.far": positive(MAX_VALUE),
+    "train.one_ray_share": number(0.0, 1.0),
+    "train.learning_rate": positive(1.0, "what suits the field kind"),
+    "train.max_grad_norm": positive(MAX_VALUE, "never cut"),
+    "train.adam_b2": BELOW_1,
+    "train.average_age": positive(0.5, "the last parameters"),
+    "uncertainty.prior_weight": positive(1e6, "1e-4 / (2^L)^3"),
 }
-
-
-def given_config(example: str = "") -> ConfigDict | None:
-    """The config that the flags give, checked; None if they give none and no `example` is due.
-
-    Raises:
-      ConfigError: it is missing, cannot be read, or holds an option that cannot be used.
-    """
-    config = flags.FLAGS.config
-    if config is None:
-        if example:
-            raise ConfigError(f"--config: is missing; try --config={example}")
-        return None
-    try:
-        return check_config(config)
-    except OSError as error:  # the config file is only read when it is first used
-        raise ConfigError(f"--config: {one_line(error)}") from None
-
-
-# What options were called, and what is read in place of it.
+SCHEMA: dict[str, Option] = {
+    name: option for names, option in _OPTIONS_OF_A_KIND.items() for name in names.split()
+}
+# What values were called, and what is read in place of it.
 OLD_VALUES = {
     "uncertainty.weighting": {
         "eq13": "gauss_newton",
@@ -259,6 +201,19 @@ OLD_VALUES = {
         "empirical": "empirical_fisher",
     }
 }
+
+# --- checks ----------------------------------------------------------------------------------
+
+
+def given_config(example: str = "") -> ConfigDict | None:
+    """The config that the flags give, checked; None if they give none and no `example` is due."""
+    config = flags.FLAGS.config
+    if config is None and example:
+        raise ConfigError(f"--config: is missing; try --config={example}")
+    try:
+        return None if config is None else check_config(config)
+    except OSError as error:  # the config file is only read when it is first used
+        raise ConfigError(f"--config: {one_line(error)}") from None
 
 
 def check_config(config: ConfigDict, *more: str, name: str = "config") -> ConfigDict:
@@ -274,42 +229,8 @@ def check_config(config: ConfigDict, *more: str, name: str = "config") -> Config
     Raises:
       ConfigError: the first option that cannot be used.
     """
-    _use_new_names(config)
-    values = check_options(config, SCHEMA | {option: views("none") for option in more}, name)
-    _check_together(values, name)
-    return config
-
-
-def _use_new_names(config: ConfigDict) -> None:
-    for option, names in OLD_VALUES.items():
-        group, _, name = option.rpartition(".")
-        part = config.get(group) if isinstance(config, ConfigDict) else None
-        value = part.get(name) if isinstance(part, ConfigDict) else None
-        if isinstance(value, str) and value in names:
-            part[name] = names[value]
-
-
-def check_options(config: ConfigDict, schema: dict[str, Option], name: str) -> dict:
-    """The options of a config by their dotted names, each checked by itself.
-
-    Raises:
-      ConfigError: one that cannot be used, is missing or is not in the schema.
-    """
-    if not isinstance(getattr(config, "items", None), Callable):
-        raise ConfigError(f"--{name}: get_config() returns {shown(config)}; return a ConfigDict")
-    values = leaves(config)
-    for option in values:
-        if option not in schema:
-            raise ConfigError(f"{name}.{option}: is no option; known are {', '.join(schema)}")
-    for option, (wanted, fits) in schema.items():
-        if option not in values:
-            raise ConfigError(f"{name}.{option}: is missing; give {wanted}")
-        if not fits(values[option]):
-            raise ConfigError(f"{name}.{option}: is {shown(values[option])}; give {wanted}")
-    return values
-
-
-def _check_together(values: dict, name: str) -> None:
+    schema = SCHEMA | {option: views("none") for option in more}
+    values = check_options(config, schema, name, OLD_VALUES)
     for group in ("hash_grid", "proposal"):
         coarsest, finest = values[f"{group}.coarsest"], values[f"{group}.finest"]
         if min(finest if isinstance(finest, tuple) else (finest,)) < coarsest:
@@ -322,14 +243,29 @@ def _check_together(values: dict, name: str) -> None:
             f"{name}.candidates: give both min_train_distance and min_candidate_distance, "
             "or neither"
         )
+    return config
 
 
-def leaves(config, prefix: str = "") -> dict:
-    """Every option by its dotted name; a group that is no group counts as an option."""
-    found = {}
-    for key, value in config.items():
-        if isinstance(value, ConfigDict):
-            found |= leaves(value, f"{prefix}{key}.")
-        else:
-            found[f"{prefix}{key}"] = value
-    return found
+def check_options(config: ConfigDict, schema: dict[str, Option], name: str, old=None) -> dict:
+    """The options of a config by their dotted names, each checked by itself.
+
+    `name` is what errors call the config; `old` has, by option, old names of values and the new
+    ones, which are put in their place. Raises ConfigError for an option that cannot be used, is
+    missing or is not in the schema.
+    """
+    if not isinstance(getattr(config, "items", None), Callable):
+        raise ConfigError(f"--{name}: get_config() returns {shown(config)}; return a ConfigDict")
+    values = leaves(config)
+    for option in values:
+        if option not in schema:
+            raise ConfigError(f"{name}.{option}: is no option; known are {', '.join(schema)}")
+    for option, (wanted, fits) in schema.items():
+        if option not in values:
+            raise ConfigError(f"{name}.{option}: is missing; give {wanted}")
+        value, names = values[option], (old or {}).get(option, {})
+        if isinstance(value, str) and value in names:
+            values[option] = value = names[value]
+            config.update_from_flattened_dict({option: value})
+        if not fits(value):
+            raise ConfigError(f"{name}.{option}: is {shown(value)}; give {wanted}")
+    return values

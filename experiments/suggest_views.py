@@ -17,8 +17,9 @@ from absl import flags
 from ml_collections import config_flags
 
 from bavs_jax.scenes import LOADERS, load_scene
-from experiments import runtime, suggestion, workdir
-from experiments.build import build_problem
+from experiments import runtime, suggestion
+from experiments.build import Problem
+from experiments.files import check_claim, claim
 from experiments.reporting.suggestion import write_results
 from experiments.schema import MAX_SEED, MAX_WIDTH, check_config
 from experiments.suggestion import Options
@@ -84,14 +85,14 @@ def read_config(data: pathlib.Path):
 def suggest_views(config, data: pathlib.Path, folder: pathlib.Path, options: Options) -> None:
     """Trains, proposes, chooses and writes."""
     begin = time.monotonic()
-    workdir.check_claim(folder, config)
+    check_claim(folder, config)
     scene = load_scene(FLAGS.loader, root=data, image_size=FLAGS.image_size)
     scene = suggestion.all_for_training(scene, FLAGS.holdout)
     around = suggestion.look_around(scene, options)
     print(f"{scene.name}: {len(scene.pool)} photos to train on, {len(scene.test)} left out")
 
-    problem = build_problem(config, scene)
-    workdir.claim(folder, config)
+    problem = Problem(config, scene)
+    claim(folder, config)
     run = train_run(config, problem, folder, FIRST_ROUND, options.seed)
     jac_sq_sum = suggestion.photo_curvature(run)
     density_fn = partial(problem.density, run.state.train)

@@ -36,13 +36,12 @@ from bavs_jax.uncertainty.channel import mean_uncertainty
 from bavs_jax.uncertainty.model import RECONSTRUCTION
 from bavs_jax.uncertainty.models.laplace import training_curvature
 from bavs_jax.uncertainty.posterior import posterior_precision
-from experiments.build import RENDER_CHUNK
+from experiments.build import stream_key
+from experiments.build_model import RENDER_CHUNK
 from experiments.configs import capture
-from experiments.errors import shown
 from experiments.evaluate import evenly_spaced
 from experiments.files import read_arrays, write_arrays
-from experiments.keys import stream_key
-from experiments.progress import track
+from experiments.runtime import shown, track
 from experiments.trained import TrainedRun
 
 KINDS = ("shell", "hemisphere", "box", "file")

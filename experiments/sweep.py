@@ -15,17 +15,16 @@ from __future__ import annotations
 import contextlib
 import pathlib
 import sys
+from collections import Counter
 
 from absl import flags
 from ml_collections import config_flags
 
-from experiments import runtime, workdir
-from experiments.files import exclusive
-from experiments.progress import track
+from bavs_jax.training.fit import MAX_RESTARTS
+from experiments import files, runtime
 from experiments.reporting.report import write_report
 from experiments.schema import check_config, given_config
 from experiments.sweeps import jobs, plan
-from experiments.sweeps.axes import parse_axes
 
 FLAGS = flags.FLAGS
 runtime.define_cache_flags()
@@ -49,7 +48,7 @@ flags.DEFINE_string("ray_address", None, "ray: the cluster; the one this machine
 flags.DEFINE_integer("retries", 2, "How often a trial is started again whose worker died.", 0)
 
 
-def make_engine() -> jobs.Engine:
+def make_engine() -> jobs.LocalEngine | jobs.RayEngine:
     """The engine that the flags name."""
     if FLAGS.engine == "ray":
         return jobs.RayEngine(FLAGS.ray_address, FLAGS.cores_per_trial)
@@ -68,22 +67,32 @@ def make_engine() -> jobs.Engine:
 def claim_folders(settings: list[plan.Setting], folder: pathlib.Path) -> plan.Record:
     """Checks every setting before anything is run, and notes what the sweep is made of."""
     for setting in settings:
-        workdir.check_claim(setting.folder, setting.config)
-    for setting in settings:
-        workdir.claim(setting.folder, setting.config)
-    rows = [
-        {
-            "folder": s.name,
-            "values": s.values,
-            "policies": [*s.config.policies],
-            "seeds": [*s.config.seeds],
-        }
-        for s in settings
-    ]
+        files.check_claim(setting.folder, setting.config)
+    rows = []
+    for s in settings:
+        files.claim(s.folder, s.config)
+        own = {"policies": [*s.config.policies], "seeds": [*s.config.seeds]}
+        rows.append({"folder": s.name, "values": s.values, **own})
     now = plan.Record(runtime.command_line(), rows, {})
     record = plan.merged(plan.read_record(folder), now)
     plan.write_record(folder, record)
     return record
+
+
+def num_rounds(trial: plan.Trial) -> int:
+    """That a trial has to train; round 0 is a trial of its own."""
+    return trial.setting.config.num_rounds if trial.part.policy else 1
+
+
+def rounds_done(trial: plan.Trial) -> float:
+    """How many of them are trained, by the number of the last checkpoint (see `Run._save`)."""
+    train = trial.setting.config.train
+    num_calls = -(-train.num_steps // train.steps_per_call)
+    folder = trial.setting.folder / trial.part.name / "checkpoints"
+    number = max((int(p.name) for p in folder.glob("*") if p.name.isdigit()), default=0)
+    attempt, calls = divmod(number, num_calls + 2)
+    done = attempt // (MAX_RESTARTS + 1) + min(calls / num_calls, 1.0)
+    return max(done - 1.0, 0.0) if trial.part.policy else done
 
 
 def run_trials(trials: list[plan.Trial], record: plan.Record, folder: pathlib.Path) -> int:
@@ -91,68 +100,59 @@ def run_trials(trials: list[plan.Trial], record: plan.Record, folder: pathlib.Pa
 
     Failures are noted in the record, and struck out when they are made good.
     """
-    by_name = {trial.job.name: trial for trial in trials}
-    counters = {
-        t.setting.name: plan.StepCounter(t.setting.folder, t.setting.config.train.num_steps)
-        for t in trials
-    }
-    running, finished, failed = set(), set(), set()
+    done = {trial.name: rounds_done(trial) for trial in trials}
+    states = dict.fromkeys(done, "waiting")
 
     def steps_done() -> int:
-        steps = {name: counter.read() for name, counter in counters.items()}
-        done = 0
-        for name, trial in by_name.items():
-            own = steps[trial.setting.name].get(trial.part.name, 0)
-            if trial.part.policy:
-                own -= trial.setting.config.train.num_steps  # round 0 is another trial's
-            ended = name in finished or name in failed
-            done += trial.num_steps if ended else min(max(own, 0), trial.num_steps)
-        return done
+        for trial in trials:
+            if states[trial.name] in ("finished", "failed"):
+                done[trial.name] = num_rounds(trial)
+            elif states[trial.name] == "started":
+                done[trial.name] = rounds_done(trial)
+        return int(sum(done[t.name] * t.setting.config.train.num_steps for t in trials))
 
     def note_end(trial: plan.Trial, reason: str) -> None:
         name = f"{trial.setting.name}/{trial.part.name}"
         record.failed.pop(name, None)
         if reason:
-            record.failed[name] = f"failed: {reason} (log: {trial.job.log})"
+            record.failed[name] = f"failed: {reason} (log: {trial.log})"
         elif trial.part.policy:
-            workdir.collect(trial.setting.folder)
+            files.collect(trial.setting.folder)
         plan.write_record(folder, record)
 
     shown = steps_done()
-    total = sum(trial.num_steps for trial in trials) - shown
-    events = jobs.run_jobs([t.job for t in trials], make_engine(), retries=FLAGS.retries)
-    with contextlib.closing(events), track(total, f"{len(trials)} processes", "steps") as bar:
-        for kind, job, reason in events:
-            if kind == "started":
-                running.add(job.name)
-            elif kind != "tick":
-                running.discard(job.name)
-                print(f"{job.name}: {kind}{': ' if reason else ''}{reason}", flush=True)
-            if kind in ("finished", "failed"):
-                (finished if kind == "finished" else failed).add(job.name)
-                note_end(by_name[job.name], reason)
-            done = steps_done()
-            counts = {"running": len(running), "finished": len(finished), "failed": len(failed)}
-            bar.advance(done - shown, **counts)
-            shown = done
-    return len(failed)
+    total = sum(num_rounds(t) * t.setting.config.train.num_steps for t in trials) - shown
+    events = jobs.run_jobs(trials, make_engine(), retries=FLAGS.retries)
+    with contextlib.closing(events), runtime.track(total, f"{len(trials)} processes") as bar:
+        for kind, trial, reason in events:
+            if trial is not None:
+                states[trial.name] = kind
+                if kind != "started":
+                    print(f"{trial.name}: {kind}{': ' if reason else ''}{reason}", flush=True)
+                if kind in ("finished", "failed"):
+                    note_end(trial, reason)
+            count, now = Counter(states.values()), steps_done()
+            numbers = {"running": count["started"], "finished": count["finished"]}
+            bar.advance(now - shown, **numbers, failed=count["failed"])
+            shown = now
+    return count["failed"]
 
 
 def write_outputs(settings: list[plan.Setting]) -> None:
     """The summary, the exported views and the report of every setting that has a result."""
     for setting in settings:
-        if not workdir.collect(setting.folder)["runs"]:
+        if not files.collect(setting.folder)["runs"]:
             continue
         first = next((p for p in setting.parts if p.policy), None)
         if first and (setting.folder / first.name / "next_views").exists():
-            workdir.export_next_views(setting.folder, first.policy, first.seed)
+            files.export_next_views(setting.folder, first.policy, first.seed)
         print(f"report: {write_report(setting.folder)}")
 
 
 def sweep(settings: list[plan.Setting], folder: pathlib.Path, given: list[str]) -> int:
     """The whole sweep; `given` are the config's flags. Returns how many trials failed."""
     record = claim_folders(settings, folder)
-    cache = runtime.cache_flags()
+    cache = [FLAGS[name].serialize() for name in ("compilation_cache", "compilation_cache_dir")]
     trials = [trial for s in settings for trial in plan.make_trials(s, given, cache)]
     planned = sum(part.policy is not None for s in settings for part in s.parts)
     left = sum(trial.part.policy is not None for trial in trials)
@@ -167,14 +167,15 @@ def sweep(settings: list[plan.Setting], folder: pathlib.Path, given: list[str]) 
 def main() -> None:
     config = given_config("experiments/configs/quickstart.py")
     folder = runtime.given_folder("workdir", "a folder for the results")
-    settings = plan.make_settings(config, parse_axes(FLAGS.axis, config, FLAGS.change), folder)
+    axes = plan.parse_axes(FLAGS.axis, config, FLAGS.change)
+    settings = plan.make_settings(config, axes, folder)
     for setting in settings:
         check_config(setting.config)
     flag = FLAGS["config"]
     given = [f"--config={config_flags.get_config_filename(flag)}"]
     overrides = config_flags.get_override_values(flag)
     given += [plan.option_flag(*item) for item in overrides.items()]
-    with exclusive(folder, wait=False):
+    with files.exclusive(folder, wait=False):
         failed = sweep(settings, folder, given)
     if failed:
         sys.exit(f"error: {failed} trial{'s' if failed > 1 else ''} failed; reasons are above")

@@ -19,10 +19,10 @@ import sys
 from absl import flags
 
 from experiments import runtime
-from experiments.errors import ReportError
 from experiments.files import write_atomic
 from experiments.reporting.result_tables import collect_all
 from experiments.reporting.tables import FORMATS, collected_text
+from experiments.runtime import ReportError
 
 FLAGS = flags.FLAGS
 flags.DEFINE_string("workdir", None, "Folder of an experiment or of a sweep: print its tables.")

@@ -30,14 +30,12 @@ from bavs_jax.training.fit import fit
 from experiments import runtime
 from experiments.bench import results
 from experiments.bench.stages import SEED, Subject
-from experiments.build_scene import load_config_scene
+from experiments.build import load_config_scene, run_key
 from experiments.configs import base
-from experiments.errors import ConfigError, shown
 from experiments.evaluate import evaluate_views, evenly_spaced
 from experiments.files import write_json
-from experiments.keys import run_key
-from experiments.progress import track
 from experiments.reporting.tables import collected_text
+from experiments.runtime import ConfigError, shown, track
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS

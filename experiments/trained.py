@@ -19,15 +19,14 @@ from bavs_jax.selection.policies import POLICIES, get_policy
 from bavs_jax.uncertainty.model import Acquired
 from bavs_jax.uncertainty.models.laplace import laplace_variance, training_curvature
 from bavs_jax.uncertainty.points import make_point_fn
-from experiments import progress
-from experiments.build import RENDER_CHUNK, Problem
-from experiments.build_trainer import KINDS
+from experiments import runtime
+from experiments.build import Problem, stream_key
+from experiments.build_model import KINDS, RENDER_CHUNK
 from experiments.configs import base
-from experiments.errors import WorkdirError
-from experiments.keys import stream_key
+from experiments.files import Part
 from experiments.runner import Run
+from experiments.runtime import WorkdirError
 from experiments.schema import check_config
-from experiments.workdir import Part
 
 # Folders of round 0, which all policies of a seed with the same kind of field share.
 FIRST_ROUNDS = {Part(None, kind, 0).name.partition("/")[0]: kind for kind in KINDS}
@@ -80,7 +79,7 @@ class TrainedRun(NamedTuple):
         """Progress over all rays of some views."""
         pixels = int(np.diff(np.asarray(self.state.table.offsets))[view_ids].sum())
         num_rays = times * self.problem.config.rays_per_pixel * pixels
-        return progress.track(num_rays, f"{self.label}: {label}", "rays")
+        return runtime.track(num_rays, f"{self.label}: {label}", "rays")
 
     def curvature(self) -> jax.Array:
         """`jac_sq_sum` [G, 3] of the training rays, with progress."""

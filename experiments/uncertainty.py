@@ -34,8 +34,8 @@ from bavs_jax.uncertainty.bands import (
 from bavs_jax.uncertainty.conformal_report import coverage_report, to_json
 from bavs_jax.uncertainty.conformal_scale import ViewGroups, split_views
 from bavs_jax.uncertainty.model import Acquired
-from experiments.build import RENDER_CHUNK, Problem
-from experiments.errors import ConfigError, WorkdirError
+from experiments.build import Problem, stream_key
+from experiments.build_model import RENDER_CHUNK
 from experiments.evaluate import evenly_spaced, image_arrays, mean_quality, render_with_bar
 from experiments.files import (
     read_arrays,
@@ -45,10 +45,8 @@ from experiments.files import (
     write_arrays,
     write_json,
 )
-from experiments.keys import stream_key
-from experiments.progress import track
 from experiments.reporting.uncertainty import LEVEL, NAME, RESULT_VERSION, save_result, write_page
-from experiments.runtime import code_commit, device_name, versions
+from experiments.runtime import ConfigError, WorkdirError, code_commit, device_name, track, versions
 from experiments.trained import FIRST_ROUND, train_run
 
 ROW_VERSION = 3  # of one model and seed; rows of another version are made anew

@@ -21,7 +21,7 @@ REACHED = 77
 LIMIT_S = 10  # then the fork is killed
 # By script, the functions with which its work begins.
 WORK = {
-    "experiments.active_selection": ("runner.run_all", "runner.make_parts"),
+    "experiments.active_selection": ("runner.run_all",),
     "experiments.suggest_views": ("suggest_views",),
     "experiments.evaluate_uncertainty": ("evaluate",),
     "experiments.sweep": ("sweep",),

@@ -15,8 +15,7 @@ from bavs_jax.candidates import (
 )
 from bavs_jax.pixel_table import make_pixel_table
 from bavs_jax.training.checkpoints import Checkpoints
-from experiments.build import build_problem
-from experiments.build_scene import initial_views, load_config_scene
+from experiments.build import Problem, initial_views, load_config_scene
 from experiments.runner import Run, saved_part, whole_state
 from tests.toy_rounds import run_round, silent, start
 from tests.toy_runs import toy_config
@@ -46,7 +45,7 @@ def problem(all_traces):
 
 
 def make_problem(config):
-    return build_problem(config, load_config_scene(config, cache_dir=None), track=silent)
+    return Problem(config, load_config_scene(config, cache_dir=None), track=silent)
 
 
 # One policy for each kind of source; all others differ from one of these by what is rendered.

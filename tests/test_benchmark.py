@@ -12,7 +12,7 @@ import pytest
 from bavs_jax.selection.batch import SelectionInfo
 from experiments.bench.results import BENCHMARK, STAGES, amount, benchmark_tables, duration
 from experiments.bench.stages import Subject, fit_growth, timed, timed_runs
-from experiments.build_scene import load_config_scene
+from experiments.build import load_config_scene
 from experiments.reporting.tables import collected_text
 from tests.toy_runs import toy_config, toy_flags
 

@@ -49,7 +49,7 @@ def test_a_device_that_computes_something_else_is_found_out(monkeypatch):
     (device,) = jax.devices("cpu")[:1]
     same = same_numbers.check_field("hash_grid", device, device)
     assert set(same.values()) == {0.0} and {"gradient", "curvature", "views, bavs"} <= same.keys()
-    original = stages.build_problem
+    original = stages.Problem
     calls = []
 
     def other_second_time(config, *args):
@@ -59,7 +59,7 @@ def test_a_device_that_computes_something_else_is_found_out(monkeypatch):
             config.uncertainty.weighting = "empirical_fisher"
         return original(config, *args)
 
-    monkeypatch.setattr(stages, "build_problem", other_second_time)
+    monkeypatch.setattr(stages, "Problem", other_second_time)
     other = same_numbers.check_field("hash_grid", device, device)
     assert other["curvature"] > 0.1 and other["loss"] == 0.0
 

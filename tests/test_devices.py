@@ -13,7 +13,7 @@ import pytest
 
 from bavs_jax.devices import make_mesh, num_shards, over_rays, put_on_all
 from experiments.build import check_shards
-from experiments.errors import ConfigError
+from experiments.runtime import ConfigError
 from tests.toy_runs import toy_config, toy_flags
 
 ROOT = pathlib.Path(__file__).parents[1]

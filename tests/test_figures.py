@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.errors import ReportError
 from experiments.reporting.pictures import first_pictures, views_figure, write_figures
 from experiments.reporting.results import load_runs
+from experiments.runtime import ReportError
 from tests.report_files import make_pictures, make_result, write_workdir
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from bavs_jax.uncertainty.bands import add_bands, calibration_to_json
 from bavs_jax.uncertainty.conformal_scale import ViewGroups
-from experiments.errors import ConfigError, WorkdirError
 from experiments.files import write_json
+from experiments.runtime import ConfigError, WorkdirError
 from experiments.uncertainty import (
     FittedModel,
     ViewSample,

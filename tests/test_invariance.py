@@ -26,7 +26,7 @@ from bavs_jax.uncertainty.measures import make_true_error_fn
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE, Acquired
 from bavs_jax.uncertainty.models import MODELS
 from bavs_jax.uncertainty.streaming import CurvatureOfRays
-from experiments.build import build_problem
+from experiments.build import Problem
 from tests.toy_fields import even_sampler
 from tests.toy_rounds import silent
 from tests.toy_runs import toy_config
@@ -110,7 +110,7 @@ class World:
     def __init__(self, name, unbounded):
         similarity = SIMILARITIES[name]
         self.scene = scene = moved_scene(similarity, unbounded)
-        setup = build_problem(toy_config(), scene, track=silent).setup
+        setup = Problem(toy_config(), scene, track=silent).setup
         sampler = even_sampler(near=scene.near, far=scene.far, num=32)
         fields, flow = toy_fields(similarity)
         models = {

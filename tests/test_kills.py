@@ -2,6 +2,7 @@
 
 import collections
 import gc
+import json
 import logging
 import re
 import sys
@@ -10,7 +11,6 @@ import threading
 import pytest
 
 from experiments import runner
-from experiments.sweeps.plan import StepCounter
 from tests.file_operations import watched
 from tests.toy_runs import TINY, same_results, toy_config
 
@@ -24,9 +24,9 @@ def run_all(monkeypatch, cache):
     """`run_all(folder)`: the script's work; scene and compiled programs are made once."""
     config = toy_config(policies=("bavs",), **TINY)
     scene = runner.load_config_scene(config, cache_dir=str(cache / "scenes"))
-    problem = runner.build_problem(config, scene)
+    problem = runner.Problem(config, scene)
     monkeypatch.setattr(runner, "load_config_scene", lambda *args, **options: scene)
-    monkeypatch.setattr(runner, "build_problem", lambda *args: problem)
+    monkeypatch.setattr(runner, "Problem", lambda *args: problem)
     return lambda folder: runner.run_all(config, folder, "command", None)
 
 
@@ -85,4 +85,5 @@ def test_killed_at_every_operation_a_run_ends_like_the_undisturbed_one(run_all, 
     assert len(known) > 200
     same_results(folder, tmp_path / "undisturbed")
     # Half a line, written when it was killed, spoils no other.
-    assert StepCounter(folder, 8).read().keys() == {"initial/seed_0", "bavs/seed_0"}
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    assert {"initial", "bavs"} == {json.loads(x)["policy"] for x in lines if x.endswith("}")}

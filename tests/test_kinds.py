@@ -10,10 +10,9 @@ import pytest
 from bavs_jax.fields.hash_grid import HashGridOptions, make_hash_grid_field
 from bavs_jax.pixel_table import make_pixel_table
 from bavs_jax.rendering.samplers import dense_samples
-from experiments.build import build_problem
-from experiments.build_field import build_flow
-from experiments.build_trainer import KINDS, build_model, build_trainer
-from experiments.errors import ConfigError
+from experiments.build import Problem
+from experiments.build_model import KINDS, build_flow, build_model, build_trainer
+from experiments.runtime import ConfigError
 from tests.toy_fields import rays_through
 from tests.toy_rounds import run_round, silent, start
 from tests.toy_runs import SMALL_NETWORKS, toy_config
@@ -34,7 +33,7 @@ TINY = {
 def tiny_problem(unbounded, **overrides):
     scene = dataclasses.replace(toy_scene(), unbounded=unbounded)
     config = toy_config(loader="blender", **TINY, **overrides)
-    return build_problem(config, scene, track=silent)
+    return Problem(config, scene, track=silent)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +137,7 @@ def test_one_ray_a_pixel_comes_first_and_several_later():
         config = toy_config(
             loader="blender", train__num_steps=8, train__steps_per_call=4, **options
         )
-        trainer = build_problem(config, scene).trainer
+        trainer = Problem(config, scene).trainer
         state, _ = trainer.call(KEY, trainer.init(KEY), table, mask)
         ends[name] = jax.tree.map(np.asarray, state), trainer
     jax.tree.map(np.testing.assert_array_equal, ends["both"][0], ends["one"][0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bavs_jax.scenes import SceneError
-from experiments.build_scene import load_config_scene
+from experiments.build import load_config_scene
 from experiments.configs import base
 from tests.scene_layouts import LAYOUTS
 

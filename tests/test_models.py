@@ -14,8 +14,8 @@ from bavs_jax.uncertainty.measures import make_true_error_fn
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired
 from bavs_jax.uncertainty.models import MODELS, get_model
 from bavs_jax.uncertainty.models.laplace import training_curvature
-from experiments.build import RENDER_CHUNK, build_problem
-from experiments.build_scene import initial_views, load_config_scene
+from experiments.build import Problem, initial_views, load_config_scene
+from experiments.build_model import RENDER_CHUNK
 from tests.toy_rounds import silent
 from tests.toy_runs import toy_config
 
@@ -29,7 +29,7 @@ every_model = pytest.mark.parametrize("name", MODELS)
 def trained():
     """A problem, and the acquired after a short training on its initial views."""
     config = toy_config(train__num_steps=64, candidates__image_scale=0.5)
-    problem = build_problem(config, load_config_scene(config, cache_dir=None), track=silent)
+    problem = Problem(config, load_config_scene(config, cache_dir=None), track=silent)
     initial = initial_views(problem.scene, 0, 4)
     mask = np.zeros(problem.scene.num_views, bool)
     mask[initial] = True

@@ -9,7 +9,7 @@ from collections import Counter
 
 import pytest
 
-from experiments.errors import ConfigError
+from experiments.runtime import ConfigError
 from experiments.schema import SCHEMA, check_config
 from tests.option_server import LIMIT_S, REACHED, WORK
 from tests.test_schema import with_value

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bavs_jax.selection.policies import POLICIES
-from experiments.build import build_problem
+from experiments.build import Problem
 from experiments.configs.paper.protocols import PROTOCOLS, get_config
 from experiments.reporting.run_tables import PAPER
 from tests.scene_files import write_nerfstudio
@@ -32,7 +32,7 @@ def load(name, *size):
 def test_every_size_builds(name, size):
     config = load(name, size)
     assert set(config.policies) <= set(POLICIES)
-    problem = build_problem(config, toy_scene())
+    problem = Problem(config, toy_scene())
     train = jax.eval_shape(problem.trainer.init, jax.random.key(0))
     assert jax.tree.leaves(train.model.params)
 

@@ -13,9 +13,8 @@ import pytest
 import trimesh
 from PIL import Image
 
-from experiments.build import build_problem
-from experiments.build_scene import load_config_scene
-from experiments.errors import WorkdirError
+from experiments.build import Problem, load_config_scene
+from experiments.runtime import WorkdirError
 from experiments.trained import choose_runs, field_kind, find_runs, load_run, saved_config
 from tests.toy_runs import toy_config, toy_flags
 
@@ -55,7 +54,7 @@ def run(cleaned, cache):
     folder, _ = cleaned
     config = saved_config(folder)
     scene = load_config_scene(config, cache_dir=str(cache / "bavs_jax" / "scenes"))
-    problem = build_problem(config, scene, field_kind(POLICY))
+    problem = Problem(config, scene, field_kind(POLICY))
     return load_run(problem, folder, POLICY, 0)
 
 

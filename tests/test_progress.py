@@ -7,7 +7,7 @@ import itertools
 
 import pytest
 
-from experiments import progress
+from experiments import runtime
 
 
 class _Terminal(io.StringIO):
@@ -17,7 +17,7 @@ class _Terminal(io.StringIO):
 
 def test_plain_lines_come_at_most_every_10_seconds_and_once_at_the_end():
     stream, now = io.StringIO(), [0.0]
-    with progress.track(30, "train", "steps", stream=stream, clock=lambda: now[0]) as task:
+    with runtime.track(30, "train", "steps", stream=stream, clock=lambda: now[0]) as task:
         for step in range(30):
             now[0] += 1.0  # one unit a second
             task.advance(1, loss=1.0 / (step + 1))
@@ -30,7 +30,7 @@ def test_plain_lines_come_at_most_every_10_seconds_and_once_at_the_end():
 
 def test_plain_numbers_stay_until_they_are_given_again():
     stream, ticks = io.StringIO(), itertools.count(0.0, 20.0)
-    with progress.track(4, "train", stream=stream, clock=lambda: next(ticks)) as task:
+    with runtime.track(4, "train", stream=stream, clock=lambda: next(ticks)) as task:
         task.advance(1, psnr=20.0)
         task.advance(2, loss=0.5)
         task.advance(1, psnr=25.5)
@@ -41,7 +41,7 @@ def test_plain_line_is_written_even_if_the_work_stops_early():
     stream = io.StringIO()
     with (
         pytest.raises(KeyboardInterrupt),
-        progress.track(5, "score", "views", stream=stream, clock=lambda: 3.0) as task,
+        runtime.track(5, "score", "views", stream=stream, clock=lambda: 3.0) as task,
     ):
         task.advance(2)
         raise KeyboardInterrupt
@@ -50,7 +50,7 @@ def test_plain_line_is_written_even_if_the_work_stops_early():
 
 def test_a_terminal_gets_a_bar():
     stream = _Terminal()
-    with progress.track(3, "train", "steps", stream=stream) as task:
+    with runtime.track(3, "train", "steps", stream=stream) as task:
         for _ in range(3):
             task.advance(1, loss=0.25)
     assert "3/3" in stream.getvalue()

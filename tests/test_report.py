@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy import stats as scipy_stats
 
-from experiments.errors import ReportError
 from experiments.reporting import camera_map, pictures, plots, run_tables, stats
 from experiments.reporting.report import make_headline, write_report
 from experiments.reporting.results import load_runs
+from experiments.runtime import ReportError
 from tests import report_files
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from bavs_jax.selection.policies import POLICIES
-from experiments.errors import ConfigError, WorkdirError
 from experiments.posthoc.lpips import remeasure
 from experiments.reporting.result_tables import collect_tables
+from experiments.runtime import ConfigError, WorkdirError
 from tests.toy_runs import toy_flags
 
 ROOT = pathlib.Path(__file__).parents[1]

@@ -1,5 +1,6 @@
 """The sweep script as a user runs it: stopped, killed, failing, and started again."""
 
+import itertools
 import json
 import os
 import signal
@@ -10,15 +11,16 @@ import numpy as np
 import pytest
 
 from experiments.configs import quickstart
-from experiments.errors import ConfigError, WorkdirError
 from experiments.files import exclusive, write_arrays, write_json
-from experiments.sweeps.axes import parse_axes, setting_name, settings
+from experiments.runtime import ConfigError, WorkdirError
 from experiments.sweeps.plan import (
     Record,
     make_settings,
     make_trials,
     merged,
+    parse_axes,
     read_record,
+    setting_name,
     write_record,
 )
 from tests.sweep_runs import (
@@ -163,15 +165,14 @@ def test_axes_are_read_by_the_type_of_their_option():
         "uncertainty.weighting": ("gauss_newton", "residual_weighted"),
         "from_scratch": (True, False),
     }
-    assert axes.options == tuple(tuple({k: v} for v in vs) for k, vs in expected.items())
-    assert len(settings(axes)) == 3 * 2 * 2 * 2 * 2
-    assert settings(axes)[0] == {name: values[0] for name, values in expected.items()}
+    combinations = itertools.product(*expected.values())
+    assert axes.settings == [dict(zip(expected, values)) for values in combinations]
     assert parse_axes([], config).policies == config.policies
 
 
 def test_options_may_change_together():
     texts = ["config.num_rounds+config.batch_size=4+4,1+16", "config.image_size=50,100"]
-    assert settings(parse_axes(texts, quickstart.get_config())) == [
+    assert parse_axes(texts, quickstart.get_config()).settings == [
         {"num_rounds": rounds, "batch_size": batch, "image_size": size}
         for rounds, batch in ((4, 4), (1, 16))
         for size in (50, 100)
@@ -186,7 +187,7 @@ def test_options_may_change_one_at_a_time(tmp_path):
     axes = parse_axes(["config.image_size=50,100"], config, changes)
     ablated = ({}, {"uncertainty.log2_cells": 5}, {"uncertainty.log2_cells": 7})
     ablated = (*ablated, {"num_rounds": 1, "batch_size": 8})
-    assert settings(axes) == [{"image_size": size} | one for size in (50, 100) for one in ablated]
+    assert axes.settings == [{"image_size": size} | one for size in (50, 100) for one in ablated]
     made = make_settings(config, parse_axes([], config, changes[:1]), tmp_path)
     names = ["unchanged", "uncertainty.log2_cells=5", "uncertainty.log2_cells=7"]
     assert [setting.name for setting in made] == names
@@ -245,8 +246,8 @@ def test_a_trial_is_a_single_run_of_one_part_and_shares_round_0(tmp_path):
     assert first.folder == tmp_path / "batch_size=2"
     trials = make_trials(first, ["--config=c.py"], ["--compilation_cache_dir=c"])
     assert [t.part.name for t in trials] == ["initial/seed_4", "random/seed_4", "bavs/seed_4"]
-    assert [t.job.needs for t in trials] == [None, *[f"{first.folder}/initial/seed_4"] * 2]
-    argv = trials[1].job.argv
+    assert [t.needs for t in trials] == [None, *[f"{first.folder}/initial/seed_4"] * 2]
+    argv = trials[1].argv
     assert argv[:3] == ("-m", "experiments.active_selection", "--config=c.py")
     assert "--config.policies=('random', 'bavs')" in argv and "--config.batch_size=2" in argv
     assert "--part=random/seed_4" in argv and "--compilation_cache_dir=c" in argv

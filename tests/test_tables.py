@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy import stats as scipy_stats
 
-from experiments.errors import ReportError
 from experiments.reporting import stats
 from experiments.reporting.result_tables import (
     cleanup_table,
@@ -28,6 +27,7 @@ from experiments.reporting.tables import (
     latex,
     markdown,
 )
+from experiments.runtime import ReportError
 from experiments.sweeps.plan import Record, write_record
 from experiments.tables import MARKED, fill_page, result_tables
 from tests.report_files import make_result, write_workdir

@@ -4,7 +4,6 @@ import copy
 
 import pytest
 
-from experiments.errors import ReportError
 from experiments.reporting.tables import Table
 from experiments.reporting.uncertainty import (
     CONSTANT,
@@ -16,6 +15,7 @@ from experiments.reporting.uncertainty import (
     summary_table,
     variants_table,
 )
+from experiments.runtime import ReportError
 from experiments.tables import result_tables
 
 LEVELS = [0.5, 0.9, 0.95]

@@ -12,8 +12,7 @@ from bavs_jax.pixel_table import num_training_pixels, training_pixels
 from bavs_jax.policy_inputs import WEIGHTING, make_candidate_curvature_fn, training_looks
 from bavs_jax.uncertainty.model import Acquired
 from bavs_jax.uncertainty.models.laplace import training_curvature
-from experiments.build import build_problem
-from experiments.build_scene import load_config_scene
+from experiments.build import Problem, load_config_scene
 from tests.toy_rounds import silent
 from tests.toy_runs import toy_config
 
@@ -27,7 +26,7 @@ SCALE = 0.5
 def make_problem(mask=None):
     config = toy_config(hash_grid__appearance_features=3)
     scene = load_config_scene(config, cache_dir=None)
-    return build_problem(config, dataclasses.replace(scene, pixel_mask=mask), track=silent)
+    return Problem(config, dataclasses.replace(scene, pixel_mask=mask), track=silent)
 
 
 def with_codes(train, codes):

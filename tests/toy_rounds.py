@@ -6,8 +6,8 @@ import jax
 
 from bavs_jax import active
 from bavs_jax.training.fit import fit
-from experiments.build_scene import initial_views
-from experiments.progress import track
+from experiments.build import initial_views
+from experiments.runtime import track
 
 
 def silent(total, label, unit):

@@ -13,9 +13,8 @@ from bavs_jax.scenes import Scene
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE
 from experiments import runtime
 from experiments.bench.stages import SEED, Subject
-from experiments.build_scene import load_config_scene
+from experiments.build import load_config_scene, run_key, stream_key
 from experiments.configs import base
-from experiments.keys import run_key, stream_key
 from experiments.reporting.tables import Cell, Table, dash
 
 DEVICE_FILE = "check_device.json"
@@ -49,7 +48,7 @@ def numbers_on(
 
     Args:
       device: one of JAX's.
-      config, scene, kind: see `build_problem`.
+      config, scene, kind: see `Problem`.
       policies: that choose a batch.
       trained: the state in numpy's arrays; None: trained here.
 

@@ -25,12 +25,9 @@ from bavs_jax.selection.policies import get_policy
 from bavs_jax.uncertainty.channel import mean_uncertainty
 from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired
 from bavs_jax.uncertainty.streaming import table_rays
-from experiments.build import RENDER_CHUNK, build_problem
-from experiments.build_scene import initial_views
-from experiments.build_trainer import train_aside
-from experiments.keys import run_key, stream_key
-from experiments.progress import track
-from experiments.runtime import peak_device_memory_mb, peak_memory_mb
+from experiments.build import Problem, initial_views, run_key, stream_key
+from experiments.build_model import RENDER_CHUNK, train_aside
+from experiments.runtime import peak_device_memory_mb, peak_memory_mb, track
 from experiments.schema import MAX_LOG2_CELLS, MAX_WIDTH, check_options, leaves, several, whole
 
 SEED = 0
@@ -88,7 +85,7 @@ class Subject:
 
     def __init__(self, config, scene: Scene, num_views: int, kind: str = RECONSTRUCTION):
         self.config, self.scene = config, scene
-        self.problem = build_problem(config, scene, kind)
+        self.problem = Problem(config, scene, kind)
         self.initial = initial_views(scene, SEED, num_views)
         self.is_training = view_mask(self.problem.table, self.initial)
         self.state = self.problem.trainer.init(stream_key(SEED, "init"))
@@ -106,7 +103,7 @@ class Subject:
         other.config = self.config.copy_and_resolve_references()
         values = {name.replace("__", "."): value for name, value in options.items()}
         other.config.update_from_flattened_dict(values)
-        other.problem = build_problem(other.config, self.scene, self.problem.kind)
+        other.problem = Problem(other.config, self.scene, self.problem.kind)
         return other
 
     def draw_cameras(self, num: int, width: int) -> Cameras:

@@ -36,7 +36,7 @@ def get_config() -> ConfigDict:
     config.checkpoint_seconds = 30.0  # at most this much work is lost when a run is killed
 
     # --- the field and how rays are sampled for it ---
-    config.field_kind = "hash_grid"  # a key of build_field.SAMPLERS
+    config.field_kind = "hash_grid"  # a key of build_model.SAMPLERS
     # "occupancy", "proposal" or "coarse_to_fine"; "": what suits field and scene.
     config.sampler_kind = ""
 

@@ -17,7 +17,7 @@ from bavs_jax.uncertainty.draws import (
     noise_scale,
 )
 from bavs_jax.uncertainty.posterior import posterior_precision
-from experiments.keys import stream_key
+from experiments.build import stream_key
 from experiments.trained import TrainedRun
 
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 import pathlib
 from collections.abc import Sequence
 
-from experiments import runtime, workdir
-from experiments.build import Problem, build_problem
-from experiments.build_scene import load_config_scene
-from experiments.errors import ConfigError, WorkdirError
+from experiments import runtime
+from experiments.build import Problem, load_config_scene
 from experiments.evaluate import measure_test_views
-from experiments.files import write_json
+from experiments.files import collect, is_completed, write_json
 from experiments.reporting.report import write_report
+from experiments.runtime import ConfigError, WorkdirError
 from experiments.sweeps.plan import read_record
 from experiments.trained import TrainedRun, field_kind, load_run, saved_config
-from experiments.workdir import is_completed
 
 PSNR_TOLERANCE = 0.02  # dB; another machine adds up in another order
 
@@ -45,7 +43,7 @@ def remeasure(
     for setting in [folder / name for name in names]:
         config = saved_config(setting)
         config.lpips_net, config.data_dir = lpips_net, data_dir or config.data_dir
-        ended = [result for result in workdir.collect(setting)["runs"] if is_completed(result)]
+        ended = [result for result in collect(setting)["runs"] if is_completed(result)]
         known = {result["policy"] for result in ended}
         if unknown := [policy for policy in policies if policy not in known]:
             raise ConfigError(f"--policy: {unknown[0]}: {setting} holds no finished run of it")
@@ -59,12 +57,12 @@ def remeasure(
         for number, result in enumerate(todo, start=1):
             kind = field_kind(result["policy"])
             if kind not in problems:
-                problems[kind] = build_problem(config, scene, kind)
+                problems[kind] = Problem(config, scene, kind)
             if problems[kind].lpips_fn is None:
                 raise ConfigError(f"--lpips_net: {problems[kind].lpips_reason}")
             run = load_run(problems[kind], setting, result["policy"], result["seed"])
             _measure_run(run, result, f"{run.label} ({number} of {len(todo)})", command)
-        workdir.collect(setting)
+        collect(setting)
         print(f"report: {write_report(setting)}")
 
 

@@ -13,13 +13,12 @@ from collections.abc import Callable, Iterator
 from absl import flags
 from ml_collections import config_flags
 
-from experiments import runtime, workdir
-from experiments.build import build_problem
-from experiments.build_scene import check_views, load_config_scene
-from experiments.errors import ConfigError
-from experiments.files import write_json
+from experiments import runtime
+from experiments.build import Problem, check_views, load_config_scene
+from experiments.files import check_claim, claim, write_json
 from experiments.reporting.result_tables import FILES
 from experiments.reporting.tables import collected_text
+from experiments.runtime import ConfigError
 from experiments.schema import MAX_SEED, given_config
 from experiments.trained import (
     FIRST_ROUND,
@@ -60,7 +59,7 @@ def trained_runs() -> Iterator[TrainedRun]:
         # A config without rounds ends where all policies begin.
         policy = FLAGS.policy or (config.policies[0] if config.num_rounds else FIRST_ROUND)
         field_kind(policy)  # an unknown policy ends here, before anything is written
-        workdir.check_claim(folder, config)
+        check_claim(folder, config)
         seeds = config.seeds if FLAGS.seed is None else (FLAGS.seed,)
         chosen = [(policy, seed) for seed in seeds]
     else:
@@ -70,9 +69,9 @@ def trained_runs() -> Iterator[TrainedRun]:
     scene = load_config_scene(config, cache_dir=runtime.scene_cache())
     if is_new:
         check_views(config, scene)
-    problem = build_problem(config, scene, field_kind(chosen[0][0]))
+    problem = Problem(config, scene, field_kind(chosen[0][0]))
     if is_new:
-        workdir.claim(folder, config)
+        claim(folder, config)
     for policy, seed in chosen:
         if is_new:
             run = train_run(config, problem, folder, policy, seed, runtime.command_line())

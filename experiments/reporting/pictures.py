@@ -15,9 +15,9 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from PIL import Image
 
-from experiments.errors import ReportError
 from experiments.reporting import plots, stats
 from experiments.reporting.results import Run, load_pictures, load_runs, policies_of
+from experiments.runtime import ReportError
 
 MAX_VIEWS, MAX_SIDE = 4, 320  # pixels; of larger pictures areas are averaged
 ERROR_LIMIT = 0.25  # the same in every report, so that pages can be laid side by side

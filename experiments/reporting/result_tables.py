@@ -10,10 +10,10 @@ import numpy as np
 
 from experiments.bench import results as bench
 from experiments.bench.same_numbers import DEVICE_FILE, differences_table
-from experiments.errors import ReportError
 from experiments.reporting import run_tables, stats, uncertainty
 from experiments.reporting.results import Run, load_runs, policies_of, read_result
 from experiments.reporting.tables import Collected, Table, interval_cell
+from experiments.runtime import ReportError
 from experiments.sweeps.plan import FILE as SWEEP_FILE
 from experiments.sweeps.plan import Record, read_record
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.errors import ReportError
 from experiments.files import cut_pictures, load_arrays, read_versioned
+from experiments.runtime import ReportError
 
 SCHEMA_VERSION = 1
 PICTURE_KEYS = ("view_ids", "names", "truth", "rgb", "error", "uncertainty", "round")

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.errors import ReportError
 from experiments.reporting import stats
 from experiments.reporting.results import Run, policies_of
 from experiments.reporting.stats import MEASURES, REFERENCES, Measure
 from experiments.reporting.tables import Cell, Table, dash, interval_cell, seconds, signed
+from experiments.runtime import ReportError
 
 RANDOM = REFERENCES[0]
 NOT_PRINTED = "the paper prints no such number"

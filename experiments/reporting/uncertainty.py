@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from bavs_jax.metrics.ause import removal_fractions, variant_name
-from experiments.errors import ReportError
 from experiments.files import cut_pictures, write_atomic
 from experiments.reporting import page, plots, stats
 from experiments.reporting.page import Section
@@ -25,6 +24,7 @@ from experiments.reporting.pictures import (
 )
 from experiments.reporting.results import read_result
 from experiments.reporting.tables import Cell, Table, dash, interval_cell
+from experiments.runtime import ReportError
 
 RESULT_VERSION = 2
 NAME = "uncertainty.json"

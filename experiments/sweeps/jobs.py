@@ -1,34 +1,34 @@
 """Jobs of a sweep: in what order they run, where, and what is done about those that die.
 
-Nothing here knows what a job does. An engine runs one job in one of its places and says how it
-ended; `run_jobs` hands it one after another.
+Nothing here knows what a job does. An engine's `start(job)` gives the handle of a job that runs, or
+None where there is no place for it now; `ended(handles)` gives those that have ended, with their
+exit status (-n: killed by signal n; None: the machine is gone); `stop(handles)` ends them.
 """
 
 from __future__ import annotations
 
 import collections
+import contextlib
+import dataclasses
 import os
 import pathlib
-import queue
 import shlex
 import shutil
 import signal
 import subprocess
 import sys
-import threading
+import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
-from experiments.errors import ConfigError
-from experiments.signals import CODES
+from experiments.runtime import ConfigError
 
-STOPPED = {code: number for number, code in CODES.items()}  # exit codes of what was asked to end
 GPU_SHARE = 0.9  # of a GPU's memory that its jobs may take together
 PATIENCE = 5.0  # seconds from asking a process to end to making it
 
 
-class Job(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Job:
     """One process of the project's Python, to be run at most once to its end."""
 
     name: str
@@ -36,22 +36,6 @@ class Job(NamedTuple):
     log: pathlib.Path  # what it prints, all attempts one after another
     is_finished: Callable[[], bool]  # from its files
     needs: str | None = None  # another job that must be finished before
-
-
-class Engine(Protocol):
-    """Where jobs run."""
-
-    num_places: int  # jobs at a time
-
-    def run(self, job: Job) -> int | None:
-        """Runs a job to its end, in a thread of its own.
-
-        Returns:
-          its exit status; -n: killed by signal n; None: its machine is gone.
-        """
-
-    def stop(self) -> None:
-        """Ends all jobs that still run; none starts from then on."""
 
 
 class Event(NamedTuple):
@@ -62,9 +46,7 @@ class Event(NamedTuple):
     reason: str = ""  # why it is tried again or has failed
 
 
-def run_jobs(
-    jobs: list[Job], engine: Engine, *, retries: int, wait_seconds: float = 1.0
-) -> Iterator[Event]:
+def run_jobs(jobs: list[Job], engine, *, retries: int, wait_seconds=1.0) -> Iterator[Event]:
     """Runs jobs to their end and says what happens; closing the iterator stops what runs.
 
     A job that is finished already is not started. One that dies without having said why (it is
@@ -73,13 +55,11 @@ def run_jobs(
     the failed one.
     """
     waiting = {job.name: job for job in jobs}
-    running, failed, attempts = {}, set(), collections.Counter()
-    threads = ThreadPoolExecutor(engine.num_places)
+    running, failed, attempts = {}, set(), collections.Counter()  # the first: jobs by handle
     try:
         while waiting or running:
-            busy = {job.name for job in running.values()}
             for job in list(waiting.values()):
-                if job.needs in waiting or job.needs in busy:
+                if job.needs in waiting or job.needs in {j.name for j in running.values()}:
                     continue
                 if job.is_finished():
                     del waiting[job.name]
@@ -88,36 +68,35 @@ def run_jobs(
                     del waiting[job.name]
                     failed.add(job.name)
                     yield Event("failed", job, f"{job.needs}, which it needs, has failed")
-                elif len(running) < engine.num_places:
-                    del waiting[job.name]
-                    busy.add(job.name)
+                elif (handle := engine.start(job)) is not None:
+                    running[handle] = waiting.pop(job.name)
                     attempts[job.name] += 1
-                    running[threads.submit(engine.run, job)] = job
                     yield Event("started", job)
-            for future in wait(running, wait_seconds, FIRST_COMPLETED).done:
-                job, code = running.pop(future), future.result()
-                died = code is None or code < 0 or code in STOPPED
+            if running:
+                time.sleep(wait_seconds)
+            for handle, code in engine.ended(running):
+                job, death = running.pop(handle), death_words(code)
                 if code == 0 and job.is_finished():
                     yield Event("finished", job)
-                elif died and attempts[job.name] <= retries:
+                elif death and attempts[job.name] <= retries:
                     waiting = {job.name: job, **waiting}  # at the head: others may wait for it
-                    yield Event("retried", job, death_words(code))
+                    yield Event("retried", job, death)
                 else:
                     failed.add(job.name)
                     again = f", {attempts[job.name]} times" if attempts[job.name] > 1 else ""
-                    reason = f"{death_words(code)}{again}" if died else last_words(job.log)
-                    yield Event("failed", job, reason)
+                    yield Event("failed", job, f"{death}{again}" if death else last_words(job.log))
             yield Event("tick")
     finally:
-        engine.stop()
-        threads.shutdown()
+        engine.stop(running)
 
 
 def death_words(code: int | None) -> str:
-    """How a process that did not end by itself came to its end."""
+    """How a process came to its end that did not end by itself; empty for one that did."""
     if code is None:
         return "its machine or its worker is gone"
-    number = STOPPED.get(code, -code)
+    number = -code if code < 0 else code - 128  # as scripts end that were asked to
+    if code >= 0 and number not in (signal.SIGINT, signal.SIGTERM):
+        return ""
     hint = "; out of memory?" if number == signal.SIGKILL else ""
     return f"killed by {signal.Signals(number).name}{hint}"
 
@@ -126,98 +105,6 @@ def last_words(log: pathlib.Path) -> str:
     """The last line of a log."""
     lines = log.read_text(encoding="utf-8", errors="replace").split("\n") if log.exists() else []
     return next((line.strip() for line in reversed(lines) if line.strip()), "printed nothing")
-
-
-# --- processes of this machine ---------------------------------------------------------------
-
-
-class Slot(NamedTuple):
-    """Where one job runs."""
-
-    cores: tuple[int, ...]
-    env: dict[str, str]
-
-
-def make_slots(
-    cores: list[int],
-    memory_gb: float,
-    gpus: list[str],
-    *,
-    jobs: int = 0,
-    cores_per_trial: int = 1,
-    gb_per_trial: float = 2.0,
-) -> list[Slot]:
-    """As many slots as fit, each with cores of its own; at least one.
-
-    Jobs that share cores hinder each other: two with one core each get more done than two with
-    both, and than one with both. Where there are GPUs, there is a slot for each, or several share
-    one if more `jobs` are asked for.
-
-    Args:
-      cores: numbers of the cores that may be used.
-      memory_gb: of the host, in units of 10^9 bytes.
-      gpus: names of the GPUs.
-      jobs: most slots; 0: as many as fit.
-      cores_per_trial: least cores of a slot.
-      gb_per_trial: host memory that a job is expected to need.
-    """
-    fit = min(len(cores) // cores_per_trial, int(memory_gb / gb_per_trial))
-    num = max(1, min(fit, jobs or len(gpus) or fit))
-    width = max(cores_per_trial, len(cores) // num) if gpus else cores_per_trial
-    slots = []
-    for i in range(num):
-        own = tuple(cores[i * width : (i + 1) * width])
-        # Read by XLA, whose own count of cores ignores that others work beside it.
-        env = {"NPROC": str(len(own))}
-        if gpus:
-            sharing = -(-num // len(gpus))
-            env["CUDA_VISIBLE_DEVICES"] = gpus[i % len(gpus)]
-            env["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{GPU_SHARE / sharing:.3f}"
-        slots.append(Slot(own, env))
-    return slots
-
-
-def usable_cores() -> list[int]:
-    """The cores that this process may use, fewer where a container has less time than that."""
-    if hasattr(os, "sched_getaffinity"):
-        cores = sorted(os.sched_getaffinity(0))
-    else:
-        cores = list(range(os.cpu_count() or 1))
-    quota, _, period = _read("/sys/fs/cgroup/cpu.max").partition(" ")
-    return cores[: max(1, int(quota) // int(period))] if quota.isdigit() and period else cores
-
-
-def free_memory_gb() -> float:
-    """Memory of the host that new processes can have, in units of 10^9 bytes."""
-    free = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    for line in _read("/proc/meminfo").splitlines():
-        if line.startswith("MemAvailable:"):
-            free = int(line.split()[1]) * 1024
-    limits = [_read(f"/sys/fs/cgroup/{n}") for n in ("memory.max", "memory/memory.limit_in_bytes")]
-    return min([free, *(int(limit) for limit in limits if limit.isdigit())]) / 1e9
-
-
-def visible_gpus() -> list[str]:
-    """Names of NVIDIA's GPUs as CUDA_VISIBLE_DEVICES takes them.
-
-    JAX is not asked: it would take their memory for this process.
-    """
-    given = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if given is not None:
-        return [name for name in given.split(",") if name]
-    if os.environ.get("JAX_PLATFORMS", "").startswith("cpu") or not shutil.which("nvidia-smi"):
-        return []
-    query = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
-    listed = subprocess.run(query, capture_output=True, text=True)
-    return listed.stdout.split() if listed.returncode == 0 else []
-
-
-def _read(path: str) -> str:
-    """A small file's text, empty where there is no such file: not every system has each."""
-    try:
-        return pathlib.Path(path).read_text(encoding="ascii").strip()
-    except OSError:
-        return ""
 
 
 def open_process(argv, log: pathlib.Path, *, env=None, cwd=None) -> subprocess.Popen:
@@ -250,37 +137,115 @@ def end_process(process: subprocess.Popen) -> None:
         process.wait()
 
 
+# --- this machine ----------------------------------------------------------------------------
+
+
+class Slot(NamedTuple):
+    """A part of this machine that one job has for itself."""
+
+    cores: tuple[int, ...]
+    env: dict[str, str]
+
+
+def make_slots(
+    cores: list[int],
+    memory_gb: float,
+    gpus: list[str],
+    *,
+    jobs: int = 0,
+    cores_per_trial: int = 1,
+    gb_per_trial: float = 2.0,
+) -> list[Slot]:
+    """Divides a machine among as many jobs as fit, at least one.
+
+    Args:
+      cores, memory_gb, gpus: what there is; a job has no GPU where there is none.
+      jobs: most jobs at a time; 0: one a GPU, or as many as cores and memory allow.
+      cores_per_trial, gb_per_trial: what each of them needs.
+    """
+    fit = min(len(cores) // cores_per_trial, int(memory_gb / gb_per_trial))
+    num = max(1, min(fit, jobs or len(gpus) or fit))
+    width = max(cores_per_trial, len(cores) // num) if gpus else cores_per_trial
+    slots = []
+    for i in range(num):
+        own = tuple(cores[i * width : (i + 1) * width])
+        # Read by XLA, whose own count of cores ignores that others work beside it.
+        env = {"NPROC": str(len(own))}
+        if gpus:
+            sharing = -(-num // len(gpus))
+            env["CUDA_VISIBLE_DEVICES"] = gpus[i % len(gpus)]
+            env["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{GPU_SHARE / sharing:.3f}"
+        slots.append(Slot(own, env))
+    return slots
+
+
+def usable_cores() -> list[int]:
+    """The cores that this process may use, fewer where a container has less time than that."""
+    affinity = getattr(os, "sched_getaffinity", lambda pid: range(os.cpu_count() or 1))
+    cores = sorted(affinity(0))
+    quota, _, period = _read("/sys/fs/cgroup/cpu.max").partition(" ")
+    return cores[: max(1, int(quota) // int(period))] if quota.isdigit() and period else cores
+
+
+def free_memory_gb() -> float:
+    """Memory of the host that new processes can have, in units of 10^9 bytes."""
+    known = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    for line in _read("/proc/meminfo").splitlines():
+        if line.startswith("MemAvailable:"):
+            known.append(int(line.split()[1]) * 1024)
+    limits = [_read(f"/sys/fs/cgroup/{n}") for n in ("memory.max", "memory/memory.limit_in_bytes")]
+    return min(known + [int(limit) for limit in limits if limit.isdigit()]) / 1e9
+
+
+def _read(path: str) -> str:
+    """A small file's text, empty where there is no such file: not every system has each."""
+    try:
+        return pathlib.Path(path).read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
+
+
+def visible_gpus() -> list[str]:
+    """Names of NVIDIA's GPUs as CUDA_VISIBLE_DEVICES takes them.
+
+    JAX is not asked: it would take their memory for this process.
+    """
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if given is not None:
+        return [name for name in given.split(",") if name]
+    if os.environ.get("JAX_PLATFORMS", "").startswith("cpu") or not shutil.which("nvidia-smi"):
+        return []
+    query = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
+    listed = subprocess.run(query, capture_output=True, text=True)
+    return listed.stdout.split() if listed.returncode == 0 else []
+
+
 class LocalEngine:
     """Each job is a process of this machine, on cores of its own."""
 
     def __init__(self, slots: list[Slot]):
-        self.num_places = len(slots)
-        self._free: queue.SimpleQueue[Slot] = queue.SimpleQueue()
-        for slot in slots:
-            self._free.put(slot)
-        self._lock, self._processes, self._stopped = threading.Lock(), set(), False
+        self._free, self._used = list(slots), {}
 
-    def run(self, job: Job) -> int | None:
-        slot = self._free.get()
-        try:
-            with self._lock:
-                if self._stopped:
-                    return None
-                if hasattr(os, "sched_setaffinity"):
-                    os.sched_setaffinity(0, slot.cores)  # of this thread, and what it starts
-                process = open_process(job.argv, job.log, env=slot.env)
-                self._processes.add(process)
-            return process.wait()
-        finally:
-            self._free.put(slot)
+    def start(self, job: Job) -> subprocess.Popen | None:
+        if not self._free:
+            return None
+        slot = self._free.pop(0)
+        process = open_process(job.argv, job.log, env=slot.env)
+        if hasattr(os, "sched_setaffinity"):
+            with contextlib.suppress(ProcessLookupError):  # it has ended already
+                os.sched_setaffinity(process.pid, slot.cores)
+        self._used[process] = slot
+        return process
 
-    def stop(self) -> None:
-        with self._lock:
-            self._stopped = True
-        left = [process for process in self._processes if process.poll() is None]
-        for process in left:
+    def ended(self, handles) -> list[tuple]:
+        done = [process for process in handles if process.poll() is not None]
+        self._free += [self._used.pop(process) for process in done]
+        return [(process, process.returncode) for process in done]
+
+    def stop(self, handles) -> None:
+        for process in handles:
             process.terminate()
-        for process in left:
+        for process in handles:
             end_process(process)
 
 
@@ -296,8 +261,6 @@ class RayEngine:
     worker, and so with its machine.
     """
 
-    num_places = 1000
-
     def __init__(self, address: str | None = None, cores_per_trial: int = 1):
         try:
             import ray
@@ -309,34 +272,33 @@ class RayEngine:
         except ConnectionError as error:
             raise ConfigError(f"--ray_address: {' '.join(str(error).split())}") from None
         gpus = 1 if ray.cluster_resources().get("GPU") else 0
-        self._task = ray.remote(
-            num_cpus=cores_per_trial, num_gpus=gpus, max_retries=0, max_calls=1
-        )(_run_process)
+        place = {"num_cpus": cores_per_trial, "num_gpus": gpus, "max_retries": 0, "max_calls": 1}
+        self._task = ray.remote(**place)(_run_process)
         self._env = {"NPROC": str(cores_per_trial)}
-        self._lock, self._running, self._stopped = threading.Lock(), set(), False
+        self._logs: dict = {}  # by handle
 
-    def run(self, job: Job) -> int | None:
-        with self._lock:
-            if self._stopped:
-                return None
-            ref = self._task.remote(job.argv, str(job.log.absolute()), self._env, os.getcwd())
-            self._running.add(ref)
+    def start(self, job: Job):
+        ref = self._task.remote(job.argv, str(job.log.absolute()), self._env, os.getcwd())
+        self._logs[ref] = job.log
+        return ref
+
+    def ended(self, handles) -> list[tuple]:
+        left = list(handles)
+        done = self._ray.wait(left, num_returns=len(left), timeout=0)[0] if left else []
+        return [(ref, self._exit_code(ref)) for ref in done]
+
+    def _exit_code(self, ref) -> int | None:
         try:
             return self._ray.get(ref)
-        except self._ray.exceptions.RayTaskError as error:
-            # The worker lives, but could not even start the process.
-            with open(job.log, "a", encoding="utf-8") as file:
+        except self._ray.exceptions.RayTaskError as error:  # the worker could not start the job
+            with open(self._logs[ref], "a", encoding="utf-8") as file:
                 file.write(f"{error}\n")
             return 1
         except self._ray.exceptions.RayError:
             return None
-        finally:
-            self._running.discard(ref)
 
-    def stop(self) -> None:
-        with self._lock:
-            self._stopped = True
-        if left := list(self._running):
+    def stop(self, handles) -> None:
+        if left := list(handles):
             for ref in left:
                 self._ray.cancel(ref, force=True)
             self._ray.wait(left, num_returns=len(left), timeout=PATIENCE)

@@ -1,25 +1,158 @@
-"""What a sweep is made of: a folder for each setting, a job for each part, and `sweep.json`."""
+"""What a sweep is made of: axes, a folder for each setting, a job for each part, `sweep.json`."""
 
 from __future__ import annotations
 
-import collections
+import ast
 import copy
 import dataclasses
-import json
+import itertools
+import math
 import pathlib
+import re
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-from experiments.errors import ConfigError, WorkdirError
-from experiments.files import read_versioned, write_json
-from experiments.sweeps.axes import Axes, setting_name, settings
+from experiments.files import Part, all_parts, is_finished, leaves, read_versioned, write_json
+from experiments.runtime import ConfigError, WorkdirError, shown
 from experiments.sweeps.jobs import Job
-from experiments.workdir import Part, all_parts, is_finished
 
+MAX_TRIALS = 10_000  # policies x seeds x settings of a sweep
+MAX_TEXT = 100_000  # characters of an axis
 UNCHANGED = "unchanged"  # folder of the config as it is, beside those of changes
 SCRIPT = ("-m", "experiments.active_selection")
 SCHEMA_VERSION = 1
 FILE = "sweep.json"
+
+# --- axes ------------------------------------------------------------------------------------
+
+
+class Axes(NamedTuple):
+    """What a sweep varies: each policy with each seed in each setting of options."""
+
+    policies: tuple[str, ...]
+    seeds: tuple[int, ...]
+    settings: list[dict[str, Any]]  # values by the option's name
+
+
+def parse_axes(texts: Sequence[str], config, changes: Sequence[str] = ()) -> Axes:
+    """Reads `name=value,value` of each axis; policies and seeds not named are the config's.
+
+    Args:
+      texts: one for each axis. Values of type int may be a range, `first:end` or
+        `first:end:step` without the end. Commas inside brackets belong to a value. Options that
+        change together are one axis: `config.num_rounds+config.batch_size=4+4,1+16`.
+      config: tells which options there are, and of what type.
+      changes: options in the same form, of which each value is tried alone, not in every
+        combination with the others.
+
+    Raises:
+      ConfigError: an axis that is unknown, given twice or empty, a value of another type, or more
+        than `MAX_TRIALS` in all.
+    """
+    known = {f"config.{name}": value for name, value in leaves(config).items()}
+    own: dict[str, tuple] = {"policy": tuple(config.policies), "seed": tuple(config.seeds)}
+    options, alone, seen = [], [], []
+    for flag, text in [("axis", t) for t in texts] + [("change", t) for t in changes]:
+        try:
+            names, rows = _parse(text, known)
+            seen += names
+            if len({*seen}) < len(seen):
+                raise ConfigError(f"{'+'.join(names)} is given twice")
+            if names[0] in own and flag == "change":
+                raise ConfigError(f"{names[0]} is an axis: --axis={text}")
+        except ConfigError as error:
+            given = text if len(text) <= 200 else shown(text)
+            raise ConfigError(f"--{flag}={given}: {error}") from None
+        if names[0] in own:
+            own[names[0]] = tuple(row[0] for row in rows)
+        else:
+            fields = [name.removeprefix("config.") for name in names]
+            values = [dict(zip(fields, row)) for row in rows]
+            if flag == "axis":
+                options.append(values)
+            else:
+                alone += values
+    policies, seeds = own["policy"], own["seed"]
+    counts = [len(policies), len(seeds), 1 + len(alone), *map(len, options)]
+    if math.prod(counts) > MAX_TRIALS:
+        raise ConfigError(
+            f"--axis: {' x '.join(map(str, counts))} are {math.prod(counts):,} trials; "
+            f"give axes of at most {MAX_TRIALS:,} in all"
+        )
+    # Every combination, as it is and then with one change at a time.
+    rows = itertools.product(*options, [{}, *alone])
+    settings = [{name: v for part in row for name, v in part.items()} for row in rows]
+    return Axes(policies, seeds, settings)
+
+
+def _parse(text: str, known: dict[str, Any]) -> tuple[list[str], list[tuple]]:
+    """Names of an axis, and rows with a value of each; `known` are the options and their values."""
+    if len(text) > MAX_TEXT:
+        raise ConfigError(f"has {len(text):,} characters; give at most {MAX_TEXT:,}")
+    name, _, values = text.partition("=")
+    if not values:
+        raise ConfigError("give name=value,value, such as seed=0:5")
+    names = name.split("+")
+    if len(names) == 1:  # a value's type is that of the example
+        known = known | {"policy": "", "seed": 0}
+    for name in names:
+        if name in ("config.policies", "config.seeds"):
+            raise ConfigError("sweep over policy=... or seed=... instead")
+        if name not in known:
+            raise ConfigError(
+                f"no axis {name}; use policy, seed or config.NAME with an option of "
+                "experiments/configs/base.py that is no group of options"
+            )
+    rows: list[tuple] = []
+    for item in _items(values):
+        parts = item.split("+") if len(names) > 1 else [item]
+        if len(parts) != len(names):
+            raise ConfigError(f"{item!r} is not {len(names)} values")
+        if type(known[names[0]]) is int and re.fullmatch(r"-?\d{1,18}(:-?\d{1,18}){1,2}", item):
+            first, end, *step = map(int, item.split(":"))
+            if step == [0]:
+                raise ConfigError(f"{item!r} has a step of 0")
+            rows += [(i,) for i in range(first, end, *step)[: MAX_TRIALS + 1]]
+        else:
+            rows.append(tuple(_value(part, known[n]) for part, n in zip(parts, names)))
+        if len(rows) > MAX_TRIALS:
+            raise ConfigError(f"has more than {MAX_TRIALS:,} values; give fewer")
+    if not rows or len({*rows}) < len(rows):
+        raise ConfigError("has no value, or one of them twice")
+    return names, rows
+
+
+def _items(text: str) -> list[str]:
+    """What stands between commas that are not in brackets."""
+    items, depth = [""], 0
+    for letter in text:
+        depth += (letter in "([") - (letter in ")]")
+        if letter == "," and depth <= 0:
+            items.append("")
+        else:
+            items[-1] += letter
+    return items
+
+
+def _value(text: str, example):
+    if isinstance(example, str):
+        return text
+    try:
+        value = ast.literal_eval(text)
+        hash(value)
+    except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
+        value = None  # the last two: too many brackets
+    if isinstance(example, float) and type(value) is int:
+        value = float(value)
+    if type(value) is not type(example):
+        raise ConfigError(
+            f"{shown(text)} is not of type {type(example).__name__}, as {example!r} is"
+        )
+    return value
+
+
+# --- settings and trials ---------------------------------------------------------------------
 
 
 class Setting(NamedTuple):
@@ -32,70 +165,65 @@ class Setting(NamedTuple):
     parts: list[Part]
 
 
-class Trial(NamedTuple):
-    """One part of one setting, and the job that makes it."""
+@dataclasses.dataclass(frozen=True)
+class Trial(Job):
+    """The job that makes one part of one setting."""
 
+    _: dataclasses.KW_ONLY
     setting: Setting
     part: Part
-    job: Job
 
-    @property
-    def num_steps(self) -> int:
-        """Optimiser steps from its beginning, round 0 not counted where it is shared."""
-        config = self.setting.config
-        return config.train.num_steps * (config.num_rounds if self.part.policy else 1)
+
+def setting_name(values: dict[str, Any]) -> str:
+    """The folder of a setting, such as `uncertainty.log2_cells=5`; `.` where nothing is set."""
+    name = ",".join(f"{option}={value}" for option, value in values.items())
+    return re.sub(r"[^\w.,=+-]+", "_", name) or "."
 
 
 def make_settings(config, axes: Axes, workdir: pathlib.Path) -> list[Setting]:
-    """The experiments that a sweep is made of.
-
-    Raises:
-      SelectionError: a policy that does not exist.
-      ConfigError: two settings whose folders would have the same name.
-    """
+    """The experiments that a sweep is made of; ConfigError if two would share a folder."""
     made: dict[str, Setting] = {}
-    for values in settings(axes):
+    parts = all_parts(axes.policies, axes.seeds)
+    has_changes = {} in axes.settings and len(axes.settings) > 1
+    for values in axes.settings:
         own = copy.deepcopy(config)
         own.policies, own.seeds = axes.policies, axes.seeds
         own.update_from_flattened_dict(values)
-        name = setting_name(values) if values or not axes.changes else UNCHANGED
-        parts = all_parts(axes.policies, axes.seeds)
+        name = UNCHANGED if has_changes and not values else setting_name(values)
         if name in made:
             raise ConfigError(f"--axis: two settings would share the folder {name}; drop one")
         made[name] = Setting(values, name, workdir / name, own, parts)
     return [*made.values()]
 
 
-def make_trials(
-    setting: Setting, config_flags: list[str], cache_flags: list[str] | None = None
-) -> list[Trial]:
+def make_trials(setting: Setting, config_flags: list[str], more: Sequence[str] = ()) -> list[Trial]:
     """A trial for each part that is not finished, and for the round 0 that such a part needs.
 
-    Args:
-      setting: the experiment.
-      config_flags: what the user gave of the config, as flags.
-      cache_flags: where compiled programs are kept, as flags; by default where a script would.
+    `config_flags` are what the user gave of the config, `more` other flags for each trial.
     """
-    left = [p for p in setting.parts if p.policy and not is_finished(setting.folder, p)]
-    wanted = {part for p in left for part in (p, p.initial)}
-    todo = [p for p in setting.parts if p in wanted and not is_finished(setting.folder, p)]
+    folder = setting.folder
+    left = [part for part in setting.parts if not is_finished(folder, part)]
+    wanted = {part.initial for part in left if part.policy}
     own = {"policies": setting.config.policies, "seeds": setting.config.seeds, **setting.values}
     # A tuple that is given twice would be added up.
-    replaced = {option_flag(name, "") for name in own}
-    kept = [flag for flag in config_flags if f"{flag.partition('=')[0]}=" not in replaced]
-    shared = (*kept, *(option_flag(name, value) for name, value in own.items()))
-    trials = []
-    for part in todo:
-        argv = (*SCRIPT, *shared, f"--workdir={setting.folder}", f"--part={part.name}")
-        job = Job(
-            name=f"{setting.folder / part.name}",
-            argv=(*argv, "--end_with_stdin", *(cache_flags or ())),
-            log=setting.folder / part.name / "log.txt",
-            is_finished=partial(is_finished, setting.folder, part),
-            needs=f"{setting.folder / part.initial.name}" if part.policy else None,
+    kept = [f for f in config_flags if f.partition("=")[0].removeprefix("--config.") not in own]
+    shared = (*SCRIPT, *kept, *(option_flag(name, value) for name, value in own.items()))
+    return [
+        Trial(
+            name=f"{folder / part.name}",
+            argv=(
+                *(*shared, f"--workdir={folder}", f"--part={part.name}"),
+                *("--end_with_stdin", *more),
+            ),
+            log=folder / part.name / "log.txt",
+            is_finished=partial(is_finished, folder, part),
+            needs=f"{folder / part.initial.name}" if part.policy else None,
+            setting=setting,
+            part=part,
         )
-        trials.append(Trial(setting, part, job))
-    return trials
+        for part in left
+        if part.policy or part in wanted
+    ]
 
 
 def option_flag(name: str, value) -> str:
@@ -103,34 +231,7 @@ def option_flag(name: str, value) -> str:
     return f"--config.{name}={value if isinstance(value, str) else repr(value)}"
 
 
-class StepCounter:
-    """Optimiser steps that each part of a working folder has behind it."""
-
-    def __init__(self, workdir: pathlib.Path, steps_per_round: int):
-        self._path, self._steps_per_round = workdir / "metrics.jsonl", steps_per_round
-        self._offset = 0
-        self._steps = collections.Counter()
-
-    def read(self) -> dict[str, int]:
-        """Steps by name of the part, round 0 included; reads only what is new since last time."""
-        if not self._path.exists():
-            return self._steps
-        with open(self._path, "rb") as file:
-            file.seek(self._offset)
-            text = file.read()
-        end = text.rfind(b"\n") + 1
-        self._offset += end
-        for line in text[:end].splitlines():
-            try:
-                event = json.loads(line)
-            except ValueError:  # what was being written when a process was killed
-                continue
-            rounds = event["round"] + (event["event"] == "round")
-            steps = rounds * self._steps_per_round + event.get("step", 0)
-            part = f"{event['policy']}/seed_{event['seed']}"
-            # A part that was killed goes back to its checkpoint, which is no progress.
-            self._steps[part] = max(self._steps[part], steps)
-        return self._steps
+# --- the record ------------------------------------------------------------------------------
 
 
 @dataclasses.dataclass
@@ -144,7 +245,7 @@ class Record:
     def missing(self, folder: str, results: set[tuple[str, int]]) -> dict[tuple[str, int], str]:
         """Why a setting's runs that have no completed result have none, by policy and seed."""
         setting = next(s for s in self.settings if s["folder"] == folder)
-        planned = [(p, s) for p in setting["policies"] for s in setting["seeds"]]
+        planned = itertools.product(setting["policies"], setting["seeds"])
         return {
             (policy, seed): self.failed.get(f"{folder}/{policy}/seed_{seed}", "not run yet")
             for policy, seed in planned
@@ -153,15 +254,10 @@ class Record:
 
 
 def read_record(workdir: pathlib.Path) -> Record | None:
-    """The record of a sweep's folder; None where there is none.
-
-    Raises:
-      WorkdirError: the file is broken or of another version.
-    """
-    path = workdir / FILE
+    """The record of a sweep's folder, None without one; WorkdirError if it cannot be used."""
+    path, fix = workdir / FILE, "delete it and run the sweep again"
     if not path.exists():
         return None
-    fix = "delete it and run the sweep again"
     content = read_versioned(path, SCHEMA_VERSION, error=WorkdirError, absent=fix, fix=fix)
     return Record(content["command"], content["settings"], content["failed"])
 
