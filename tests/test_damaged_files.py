@@ -21,7 +21,6 @@ from experiments.sweeps.plan import StepCounter
 from experiments.trained import saved_config
 from tests.toy_runs import TINY, same_results, toy_config, toy_flags
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 ROOT = pathlib.Path(__file__).parents[1]
 PART = "bavs/seed_0"
 

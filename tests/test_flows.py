@@ -17,8 +17,6 @@ from bavs_jax.fields.flow_field import (
 from bavs_jax.fields.flows import apply_flows, flow_from_raw, num_flow_parameters
 from tests.oracles_flows import invert_flows
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 BOX = np.array([[-1.0, -2.0, -1.0], [1.0, 2.0, 3.0]], np.float32)
 NUM_FLOWS = 4
 

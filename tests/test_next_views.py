@@ -17,8 +17,6 @@ from experiments.acquisitions import CAMERA_FIELDS, write_next_views
 from experiments.suggest.results import write_transforms
 from tests.scene_files import edit_json, random_image, write_nerfstudio
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 WIDTH, HEIGHT = 24, 16
 LENSES = {
     "pinhole": {"camera_model": "PINHOLE", "k1": None, "p2": None},

@@ -20,8 +20,6 @@ from experiments.posthoc.points import user_point_fn
 from experiments.trained import choose_runs, field_kind, find_runs, load_run, saved_config
 from tests.toy_runs import toy_config, toy_flags
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 ROOT = pathlib.Path(__file__).parents[1]
 POLICY = "random"
 OVERRIDES = {"policies": (POLICY,), "num_rounds": 1}

@@ -34,8 +34,6 @@ from tests.oracles_rendering import march_loop, render_loop, weights_loop
 from tests.toy_fields import rays_through, smooth_field_fn
 from tests.toy_scenes import toy_scene
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], np.float32)
 WHITE = jnp.ones(3)
 

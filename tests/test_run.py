@@ -168,7 +168,6 @@ def test_another_config_in_the_same_folder_is_refused(finished):
 # --- LPIPS afterwards ---
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_lpips_is_added_to_finished_runs(unmeasured, capsys):
     before = {policy: load(unmeasured, policy) for policy in ("bavs", "random")}
     remeasure(unmeasured, "later", policies=["random"])
@@ -186,7 +185,6 @@ def test_lpips_is_added_to_finished_runs(unmeasured, capsys):
     assert "nothing is left to measure" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_remeasuring_notices_another_scene_and_a_missing_run(unmeasured):
     path = unmeasured / "random" / "seed_0" / "result.json"
     result = load(unmeasured, "random")
