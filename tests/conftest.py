@@ -19,6 +19,18 @@ if importlib.metadata.version("jaxlib").startswith("0.10."):
     given = os.environ.get("XLA_FLAGS", "").replace(NO_EMITTERS, "")
     os.environ["XLA_FLAGS"] = f"{NO_EMITTERS} {given}".strip()
 
+# Files that take longest, in any order.
+LONG = (
+    *("test_suggest_views", "test_run", "test_models", "test_evaluate_uncertainty"),
+    *("test_damaged_files", "test_kinds", "test_active", "test_same_colours", "test_compiled"),
+    *("test_goldens", "test_sweep", "test_posthoc", "test_devices", "test_option_campaign"),
+)
+
+
+def pytest_collection_modifyitems(items):
+    """Long files first, so that no worker is left alone with one at the end."""
+    items.sort(key=lambda item: item.path.stem not in LONG)
+
 
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory):

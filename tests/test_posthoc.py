@@ -2,7 +2,6 @@
 
 import io
 import json
-import os
 import pathlib
 import subprocess
 import sys
@@ -27,11 +26,9 @@ OVERRIDES = {"policies": (POLICY,), "num_rounds": 1}
 
 def script(name, *flags):
     """Runs a script to its end."""
-    env = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
     return subprocess.run(
         [sys.executable, "-m", f"experiments.{name}", *flags],
         cwd=ROOT,
-        env=env,
         capture_output=True,
         text=True,
         timeout=1200,

@@ -139,11 +139,14 @@ def test_list_policies_prints_one_a_line():
 @pytest.mark.parametrize(
     "flags, message",
     [
-        (["--config.policies=('bavz',)"], "bavz"),
+        pytest.param(["--config.policies=('bavz',)"], "bavz", marks=pytest.mark.slow),
         (["--config.loader=blender"], "BAVS_DATA"),
-        (["--config.loader=blender", "--config.data_dir=/nowhere"], "/nowhere"),
+        pytest.param(
+            ["--config.loader=blender", "--config.data_dir=/nowhere"],
+            "/nowhere",
+            marks=pytest.mark.slow,
+        ),
         (["--config.num_initial=1000"], "num_initial is 1000, but the pool has 100"),
-        (["--config.uncertainty.weighting=eq12"], "eq12"),
         (["--config.no_such_option=1"], "no_such_option"),
     ],
 )
