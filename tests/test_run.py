@@ -141,12 +141,12 @@ def test_list_policies_prints_one_a_line():
     [
         pytest.param(["--config.policies=('bavz',)"], "bavz", marks=pytest.mark.slow),
         (["--config.loader=blender"], "BAVS_DATA"),
+        (["--config.loader=blender", "--config.data_dir=/nowhere"], "/nowhere"),
         pytest.param(
-            ["--config.loader=blender", "--config.data_dir=/nowhere"],
-            "/nowhere",
+            ["--config.num_initial=1000"],
+            "num_initial is 1000, but the pool has 100",
             marks=pytest.mark.slow,
         ),
-        (["--config.num_initial=1000"], "num_initial is 1000, but the pool has 100"),
         (["--config.no_such_option=1"], "no_such_option"),
     ],
 )
