@@ -45,7 +45,7 @@ setup(
             "pycolmap>=3.11",
             "pynrrd>=1.1",
             "pytest>=8.0",
-            "pytest-xdist>=3.6",
+            "pytest-xdist>=3.8",
             "ruff>=0.9",
             "scikit-image>=0.23",
             "trimesh>=4.4",

@@ -1,11 +1,35 @@
-"""Fixtures that many modules use."""
+"""Fixtures that many modules use, and how tests compile."""
 
+import importlib.metadata
 import os
 
 import jax
 import pytest
 
 from experiments.runtime import use_compilation_cache
+
+# Set before XLA starts, for tests and for the scripts that they start. Most of a test's time is XLA
+# compiling programs that run once: with few optimisations it takes half as long, and half of that
+# again without the emitters that write fused loops. Later releases of jaxlib may not know the flag,
+# and a process ends at one that it does not know.
+jax.config.update("jax_disable_most_optimizations", True)
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
+NO_EMITTERS = "--xla_cpu_use_fusion_emitters=false"
+if importlib.metadata.version("jaxlib").startswith("0.10."):
+    given = os.environ.get("XLA_FLAGS", "").replace(NO_EMITTERS, "")
+    os.environ["XLA_FLAGS"] = f"{NO_EMITTERS} {given}".strip()
+
+# Files that take longest, in any order.
+LONG = (
+    *("test_suggest_views", "test_run", "test_models", "test_evaluate_uncertainty"),
+    *("test_damaged_files", "test_kinds", "test_active", "test_same_colours", "test_compiled"),
+    *("test_goldens", "test_sweep", "test_posthoc", "test_devices", "test_option_campaign"),
+)
+
+
+def pytest_collection_modifyitems(items):
+    """Long files first, so that no worker is left alone with one at the end."""
+    items.sort(key=lambda item: item.path.stem not in LONG)
 
 
 @pytest.fixture(scope="session")
@@ -27,13 +51,16 @@ def compiled_programs(cache):
         yield
 
 
-@pytest.fixture(scope="module")
-def quick_compilation():
-    """Compiles with few optimisations: for modules that compile much and run each thing once.
+@pytest.fixture
+def users_compilation(monkeypatch):
+    """Optimises as for users, here and in scripts that the test starts.
 
-    Scripts that tests start, and all other modules, compile as users do.
+    For tests that are about what the optimiser makes of a program, or that compare with what users
+    get. What is compiled in this process must ask for the emitters itself: `compiler_options` of
+    `jax.jit`.
     """
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "0")
+    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", "").replace(NO_EMITTERS, ""))
+    jax.config.update("jax_disable_most_optimizations", False)
     yield
-    jax.config.update("jax_disable_most_optimizations", before)
+    jax.config.update("jax_disable_most_optimizations", True)

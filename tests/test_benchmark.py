@@ -1,7 +1,6 @@
 """The benchmark: what is timed, what is fitted, and a tiny run from end to end."""
 
 import json
-import os
 import pathlib
 import subprocess
 import sys
@@ -71,7 +70,6 @@ def test_timing_waits_for_the_result():
     assert values == [results] * 3 and len(waited) == 10
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_selection_is_timed_by_the_path_of_runs():
     config = toy_config()
     subject = Subject(config, load_config_scene(config, cache_dir=None), 3)
@@ -127,11 +125,9 @@ def measured(tmp_path_factory):
     command = [sys.executable, "-m", "experiments.benchmark", f"--workdir={folder}"]
     command += toy_flags(train__num_steps=16, march__num_slots=8)
     command += [f"--sizes.{name}={value}" for name, value in SIZES.items()]
-    quick = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
     done = subprocess.run(
         [*command, "--num_views=3", "--profile"],
         cwd=ROOT,
-        env=os.environ | quick,
         capture_output=True,
         text=True,
     )

@@ -24,8 +24,6 @@ from bavs_jax.uncertainty.curvature import add_jac_sq_sum
 from tests.toy_fields import NOTHING_LEARNT, even_sampler, ray_model
 from tests.traces import count_traces
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 BOX = jnp.array([[-1.0] * 3, [1.0] * 3])
 GRID = DeformationGrid(BOX, 4)
 BACKGROUND = np.ones(3, np.float32)

@@ -20,7 +20,6 @@ from experiments.runtime import ReportError, WorkdirError
 from experiments.trained import saved_config
 from tests.toy_runs import TINY, same_results, toy_config, toy_flags
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
 ROOT = pathlib.Path(__file__).parents[1]
 PART = "bavs/seed_0"
 

@@ -21,7 +21,8 @@ JOBS = ("colour", "proposals", "variance", "flow")
 
 
 def start(module, *arguments, num_devices=1):
-    flags = f"--xla_force_host_platform_device_count={num_devices}"
+    given = os.environ.get("XLA_FLAGS", "")
+    flags = f"{given} --xla_force_host_platform_device_count={num_devices}"
     return subprocess.Popen(
         [sys.executable, "-m", module, *map(str, arguments)],
         stdout=subprocess.PIPE,

@@ -31,8 +31,6 @@ from tests.toy_fields import (
 from tests.toy_scenes import toy_scene
 from tests.traces import count_traces
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 BOX = jnp.array([[-1.0] * 3, [1.0] * 3])
 GRID = DeformationGrid(BOX, 2)
 SAMPLER = even_sampler(near=1.5, far=4.5, num=24)

@@ -31,8 +31,6 @@ from bavs_jax.uncertainty.points import make_point_fn
 from tests.toy_fields import NOTHING_LEARNT, even_sampler, ray_model, smooth_field, smooth_field_fn
 from tests.toy_scenes import toy_scene
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 0.5]])
 RNG = np.random.default_rng(0)
 TURNED = np.array(  # 2 times a quarter turn about z, and a shift

@@ -10,8 +10,6 @@ from bavs_jax.fields.hash_grid import HashGridOptions, make_hash_grid_field
 from bavs_jax.numerics import density_from_raw, safe_divide, safe_reciprocal
 from tests.oracles_rendering import interpolate_level_loop
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 BOX = np.array([[-1.0, -2.0, -1.0], [1.0, 2.0, 3.0]], np.float32)
 
 

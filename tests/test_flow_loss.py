@@ -20,8 +20,6 @@ from bavs_jax.models.losses import (
 )
 from tests.oracles_flows import kernel_log_density_loop
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 
 def some_draws(num_draws=8, num_rays=5, seed=0):
     rng = np.random.default_rng(seed)

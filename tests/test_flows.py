@@ -21,8 +21,6 @@ from bavs_jax.fields.hash_grid import HashGridOptions
 from bavs_jax.fields.nerf_mlp import NerfMlpOptions
 from tests.oracles_flows import invert_flows
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 BOX = np.array([[-1.0, -2.0, -1.0], [1.0, 2.0, 3.0]], np.float32)
 NUM_FLOWS = 4
 

@@ -18,8 +18,6 @@ from experiments.evaluate import mean_quality
 from tests.scene_files import edit_json, write_nerfstudio
 from tests.test_cameras import project
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 SIZE = WIDTH, HEIGHT = 48, 27
 INTRINSICS = np.array([0.52 * WIDTH, 0.52 * WIDTH, 24.5, 13.0])
 WIDE = {"k1": -0.27, "k2": 0.03}  # an action camera, calibrated with too few coefficients

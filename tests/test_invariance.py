@@ -32,8 +32,6 @@ from tests.toy_rounds import silent
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 KEY = jax.random.key(3)
 NUM_VIEWS, INITIAL, BATCH = 16, [0, 5, 9], 4
 # Quarter turns keep the box, and with it the grid, along the axes.

@@ -68,7 +68,7 @@ def start(run_all, folder, known: set) -> tuple | None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("quick_compilation", "silent_threads")
+@pytest.mark.usefixtures("silent_threads")
 def test_killed_at_every_operation_a_run_ends_like_the_undisturbed_one(run_all, tmp_path):
     run_all(tmp_path / "undisturbed")
     known: set = set()

@@ -9,8 +9,6 @@ import pytest
 
 from bavs_jax import lenses
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 # k1, k2, k3, k4, p1, p2, and the largest radius in use: in the plane z = -1, or radians.
 OPENCV_LENSES = {
     "phone": ([0.08, -0.19, 0.12, 0.0, 0.001, -0.002], 1.0),

@@ -19,8 +19,6 @@ from experiments.build_model import RENDER_CHUNK
 from tests.toy_rounds import silent
 from tests.toy_runs import toy_config
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 KEY = jax.random.key(5)
 every_model = pytest.mark.parametrize("name", MODELS)
 

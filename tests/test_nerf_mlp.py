@@ -20,8 +20,6 @@ from bavs_jax.rendering.spacing import box_intervals
 from tests.oracles_unbounded import frustum_draws
 from tests.toy_fields import rays_through
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], np.float32)
 
 

@@ -16,8 +16,6 @@ from experiments.reporting.suggestion import write_poses
 from experiments.runner import CAMERA_FIELDS, write_next_views
 from tests.scene_files import edit_json, random_image, write_nerfstudio
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 WIDTH, HEIGHT = 24, 16
 LENSES = {
     "pinhole": {"camera_model": "PINHOLE", "k1": None, "p2": None},

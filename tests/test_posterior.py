@@ -18,8 +18,6 @@ from bavs_jax.uncertainty.posterior import (
     posterior_precision,
 )
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 GRID = DeformationGrid(jnp.array([[-1.0, -1, -1], [1.0, 1, 1]]), 2)
 POINTS = jax.random.uniform(jax.random.key(0), (20, 3), minval=-0.95, maxval=0.95)
 

@@ -2,7 +2,6 @@
 
 import io
 import json
-import os
 import pathlib
 import subprocess
 import sys
@@ -18,8 +17,6 @@ from experiments.runtime import WorkdirError
 from experiments.trained import choose_runs, field_kind, find_runs, load_run, saved_config
 from tests.toy_runs import toy_config, toy_flags
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 ROOT = pathlib.Path(__file__).parents[1]
 POLICY = "random"
 OVERRIDES = {"policies": (POLICY,), "num_rounds": 1}
@@ -27,11 +24,9 @@ OVERRIDES = {"policies": (POLICY,), "num_rounds": 1}
 
 def script(name, *flags):
     """Runs a script to its end."""
-    env = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
     return subprocess.run(
         [sys.executable, "-m", f"experiments.{name}", *flags],
         cwd=ROOT,
-        env=env,
         capture_output=True,
         text=True,
         timeout=1200,

@@ -20,8 +20,6 @@ from bavs_jax.uncertainty.predictive import make_predictive_fn, predictive_varia
 from tests.oracles_curvature import colours_with_offsets, dense_depth_jacobian, dense_jacobian
 from tests.toy_fields import ray_model, rays_through, smooth_field, smooth_field_fn
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 BOX = np.array([[-1.0, -1.2, -0.8], [1.0, 1.1, 0.9]])
 BACKGROUND = np.array([1.0, 0.9, 0.8])
 OPTIONS = make_march_options(BOX, near=0.0, far=10.0, num_steps=24, num_slots=16)

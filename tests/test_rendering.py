@@ -34,8 +34,6 @@ from tests.oracles_rendering import march_loop, render_loop, weights_loop
 from tests.toy_fields import rays_through, smooth_field_fn
 from tests.toy_scenes import toy_scene
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]], np.float32)
 WHITE = jnp.ones(3)
 
@@ -271,19 +269,17 @@ def test_colours_and_their_gradients_change_by_less_than_the_light_that_is_left(
     assert fits.all() and 0.1 < mask.sum() / before.sum() < 0.95
     assert (np.diff(mask.astype(int), axis=1) <= 0).all() and not (mask & ~before).any()
 
+    @jax.jit
     def colours(scale, samples):
         return render_rays(
             rays, samples, partial(field_fn, scale), background=WHITE, capacity=4000, exact=False
         ).rgb
 
     np.testing.assert_allclose(colours(1.0, kept), colours(1.0, samples), atol=least)
-    for ray in (0, 20, 40):
-        slope, wanted = (
-            jax.grad(lambda scale, s=s, ray=ray: colours(scale, s)[ray, 0])(1.0)
-            for s in (kept, samples)
-        )
-        # d T / d scale is -tau exp(-tau), with tau = -log(least) where samples end.
-        np.testing.assert_allclose(slope, wanted, atol=2.0 * least * (1.0 - np.log(least)))
+    slopes = jax.jit(jax.jacrev(lambda scale, s: colours(scale, s)[jnp.array([0, 20, 40]), 0]))
+    # d T / d scale is -tau exp(-tau), with tau = -log(least) where samples end.
+    atol = 2.0 * least * (1.0 - np.log(least))
+    np.testing.assert_allclose(slopes(1.0, kept), slopes(1.0, samples), atol=atol)
     again, _ = jax.jit(visible_samples, static_argnums=0, static_argnames=("capacity", "least"))(
         lambda x: field_fn(1.0, x, x)[0], rays, samples, capacity=4000, least=least
     )
@@ -363,7 +359,7 @@ def test_one_pass_takes_a_ray_that_just_fits(spare, whole_rays):
 
 def render(rays, samples, **kwargs):
     settings = {"background": WHITE, "capacity": 64, "exact": True} | kwargs
-    return render_rays(rays, samples, smooth_field_fn, **settings)
+    return jax.jit(partial(render_rays, field_fn=smooth_field_fn, **settings))(rays, samples)
 
 
 def test_renderer_agrees_with_a_loop():
@@ -417,7 +413,8 @@ def test_packed_gradients_equal_dense_ones():
         weights = render_weights(density * samples.sample_mask, samples.deltas)
         return jnp.square(composite(weights, rgb, WHITE)).sum()
 
-    np.testing.assert_allclose(jax.grad(packed)(1.1), jax.grad(dense)(1.1), rtol=1e-4)
+    slopes = jax.jit(lambda scale: (jax.grad(packed)(scale), jax.grad(dense)(scale)))
+    np.testing.assert_allclose(*slopes(1.1), rtol=1e-4)
 
 
 def test_displacement_by_a_constant_is_a_shift_of_the_rays():

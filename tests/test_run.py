@@ -139,11 +139,14 @@ def test_list_policies_prints_one_a_line():
 @pytest.mark.parametrize(
     "flags, message",
     [
-        (["--config.policies=('bavz',)"], "bavz"),
+        pytest.param(["--config.policies=('bavz',)"], "bavz", marks=pytest.mark.slow),
         (["--config.loader=blender"], "BAVS_DATA"),
         (["--config.loader=blender", "--config.data_dir=/nowhere"], "/nowhere"),
-        (["--config.num_initial=1000"], "num_initial is 1000, but the pool has 100"),
-        (["--config.uncertainty.weighting=eq12"], "eq12"),
+        pytest.param(
+            ["--config.num_initial=1000"],
+            "num_initial is 1000, but the pool has 100",
+            marks=pytest.mark.slow,
+        ),
         (["--config.no_such_option=1"], "no_such_option"),
     ],
 )
@@ -168,7 +171,6 @@ def test_another_config_in_the_same_folder_is_refused(finished):
 # --- LPIPS afterwards ---
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_lpips_is_added_to_finished_runs(unmeasured, capsys):
     before = {policy: load(unmeasured, policy) for policy in ("bavs", "random")}
     remeasure(unmeasured, "later", policies=["random"])
@@ -186,7 +188,6 @@ def test_lpips_is_added_to_finished_runs(unmeasured, capsys):
     assert "nothing is left to measure" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_remeasuring_notices_another_scene_and_a_missing_run(unmeasured):
     path = unmeasured / "random" / "seed_0" / "result.json"
     result = load(unmeasured, "random")

@@ -26,8 +26,6 @@ from bavs_jax.uncertainty.streaming import make_curvature_fn
 from tests.oracles_curvature import defined_jacobian, split_jacobian
 from tests.toy_fields import rays_through
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 BOX = np.array([[-1.0, -1.2, -0.8], [1.0, 1.1, 0.9]], np.float32)
 NUM_RAYS, NUM_VIEWS, CAPACITY = 30, 5, 4096
 

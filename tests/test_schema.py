@@ -134,6 +134,7 @@ def test_an_option_that_is_a_group_or_missing_or_unknown_is_named():
         ("candidates.image_scale", -1.0, r"is -1\.0; give a number above 0 to 1"),
         ("view_seed", "4294967296", "is '4294967296'; give a whole number from 0 to 4,294,967,295"),
         ("lpips_net", "nonsense", "is 'nonsense'; give one of '', 'alex', 'vgg'"),
+        ("uncertainty.weighting", "eq12", "is 'eq12'; give one of "),
         ("policies", ("bavs", "bavs"), "each once"),
         ("policies", ("bavz",), "'bavs'"),
         ("seeds", (2**32,), "0 to 4,294,967,295"),

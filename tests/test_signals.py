@@ -64,11 +64,11 @@ def hold(pipe, process):
     raise TimeoutError(pipe)
 
 
-def check_stopped(process, number, pipe=None):
-    """Exit code, one line and nothing else on standard error, soon."""
+def check_stopped(process, number, pipe=None, *, seconds=10):
+    """Exit code, one line and nothing else on standard error, within some seconds."""
     held = hold(pipe, process) if pipe else None
     process.send_signal(number)
-    _, err = process.communicate(timeout=10)
+    _, err = process.communicate(timeout=seconds)
     if held is not None:
         os.close(held)
     assert (process.returncode, err) == (CODES[number], WORDS)
@@ -117,7 +117,9 @@ def test_a_run_that_trains_stops_and_leaves_no_half_file(tmp_path):
     while not any((tmp_path / "initial" / "seed_0").glob("checkpoints/[0-9]*")):
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
         time.sleep(0.01)
-    check_stopped(process, signal.SIGTERM)
+    # Python handles a signal between two of its own steps, so not before XLA has compiled what it
+    # is at, which takes a slow machine more than 10 seconds.
+    check_stopped(process, signal.SIGTERM, seconds=120)
     assert not [*tmp_path.rglob(".*.tmp")] and not (tmp_path / "report.html").exists()
 
 

@@ -16,8 +16,6 @@ from experiments.build import Problem, load_config_scene
 from tests.toy_rounds import silent
 from tests.toy_runs import toy_config
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 KEY = jax.random.key(0)
 TAKEN = [1, 4, 7]
 SCALE = 0.5

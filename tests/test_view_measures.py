@@ -12,8 +12,6 @@ from bavs_jax.uncertainty.warp import WarpSources, sample_bilinear, warp_disagre
 from tests import oracles_pixel as oracles
 from tests.traces import count_traces
 
-pytestmark = pytest.mark.usefixtures("quick_compilation")
-
 SIZE = (12, 10)  # width, height
 NUM = 6
 novelty_fn = jax.jit(direction_novelty)
