@@ -203,7 +203,9 @@ class Problem:
         self.grid = DeformationGrid(
             jnp.asarray(scene.box), uncertainty.log2_cells, contracted=scene.unbounded
         )
-        prior_weight = uncertainty.prior_weight or default_prior_weight(uncertainty.log2_cells)
+        prior_weight = uncertainty.prior_weight
+        if prior_weight is None:
+            prior_weight = default_prior_weight(uncertainty.log2_cells)
         self.laplace = LaplaceOptions(
             prior_weight=prior_weight / float(offset_unit(scene.box)) ** 2,
             max_rays=uncertainty.max_rays or None,
@@ -305,7 +307,7 @@ class Problem:
             centre=self.scene.centre,
             batch_size=self.config.batch_size,
             num_rays=int(num_training_pixels(self.scene, np.asarray(initial)).sum()),
-            radii=Radii(*radii) if any(radii) else None,
-            mode=options.mode or None,
+            radii=None if None in radii else Radii(*radii),
+            mode=options.mode,
             label=label,
         )

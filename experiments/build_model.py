@@ -212,8 +212,11 @@ def build_trainer(config, model: RayField) -> Trainer:
     `config.rays_per_pixel`, whose mean is what a photo shows.
     """
     train = config.train
+    learning_rate = train.learning_rate
+    if learning_rate is None:
+        learning_rate = LEARNING_RATES[config.field_kind]
     optimiser, schedule = make_optimiser(
-        learning_rate=train.learning_rate or LEARNING_RATES[config.field_kind],
+        learning_rate=learning_rate,
         warmup=train.warmup_steps,
         second_decay=train.adam_b2,
         epsilon=train.adam_eps,

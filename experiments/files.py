@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import errno
 import fcntl
 import json
@@ -273,6 +274,45 @@ def leaves(config, prefix: str = "") -> dict:
     return found
 
 
+# What values of options were called in earlier versions, and what is read in place of it.
+OLD_VALUES: dict[str, dict] = {
+    "uncertainty.weighting": {
+        "eq13": "gauss_newton",
+        "eq11": "residual_weighted",
+        "empirical": "empirical_fisher",
+    },
+    "data_dir": {"": None},
+    "load.split": {"": None},
+    "sampler_kind": {"": None},
+    "candidates.mode": {"": None},
+    "load.downscale": {0: None},
+    "load.pool_size": {0: None},
+    "load.test_every": {0: None},
+    "train.learning_rate": {0: None},
+    "uncertainty.prior_weight": {0: None},
+    "candidates.min_train_distance": {0: None},
+    "candidates.min_candidate_distance": {0: None},
+    "view_seed": {"": None},
+}
+
+
+def modern(saved: dict) -> dict:
+    """A `config.json` of an earlier version in the words of this one."""
+    saved = copy.deepcopy(saved)
+    if "field" in saved:
+        saved["hash_grid"] = saved.pop("field")
+    for option, names in OLD_VALUES.items():
+        *groups, name = option.split(".")
+        group = saved
+        for part in groups:
+            group = group.get(part, {})
+        if name in group and type(group[name]) in (str, int, float):
+            group[name] = names.get(group[name], group[name])
+    if type(saved.get("view_seed")) is str:  # a seed was written as text
+        saved["view_seed"] = int(saved["view_seed"])
+    return saved
+
+
 def check_claim(workdir: pathlib.Path, config) -> None:
     """Raises WorkdirError if a folder holds runs of another config; writes nothing."""
     path = workdir / "config.json"
@@ -281,7 +321,7 @@ def check_claim(workdir: pathlib.Path, config) -> None:
     if not has_work or not path.exists():
         return
     try:
-        before = load_json(path)
+        before = modern(load_json(path))
     except ValueError as error:
         raise WorkdirError(
             f"{error}: delete it if the runs there are of this config, and start again; or use "

@@ -54,7 +54,7 @@ class Run:
         self.label = f"{policy or 'initial'} seed {seed}"
         self.part = Part(policy, problem.kind, seed)
         self.folder = workdir / self.part.name
-        view_seed = int(config.view_seed or seed)
+        view_seed = seed if config.view_seed is None else config.view_seed
         self.initial = initial_views(problem.scene, view_seed, config.num_initial)
         self.rounds: list[dict] = []  # of result.json
         self.pending = _new_pending()  # what is known of the round under way

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -22,7 +21,7 @@ from bavs_jax.uncertainty.conformal_scale import SCALES as INTERVAL_SCALES
 from bavs_jax.uncertainty.curvature import WEIGHTINGS
 from bavs_jax.uncertainty.models import MODELS
 from experiments.build_model import SAMPLERS
-from experiments.files import leaves
+from experiments.files import OLD_VALUES, leaves
 from experiments.runtime import ConfigError, one_line, shown
 
 MAX_SEED = 2**32 - 1  # a larger one is the key of another seed, or none
@@ -84,13 +83,14 @@ def several(item: Option, least: int, most: int, *, distinct: bool = True) -> Op
     return Option(f"a tuple of {least:,} to {most:,}{once}: {item.wanted}", fits)
 
 
-def _is_seed_text(value) -> bool:
-    digits = type(value) is str and re.fullmatch("[0-9]{1,10}", value)
-    return value == "" or (bool(digits) and int(value) <= MAX_SEED)
+def default(option: Option, meaning: str) -> Option:
+    """The option or None, which stands for what is best by default."""
+    wanted = f"{option.wanted}, or None: {meaning}"
+    return Option(wanted, lambda value: value is None or option.fits(value))
 
 
 def _is_pool_size(value) -> bool:
-    fits = type(value) in (int, float) and 0 <= value <= 100_000
+    fits = type(value) in (int, float) and 0 < value <= 100_000
     return fits and (value < 1 or value == int(value))
 
 
@@ -101,6 +101,7 @@ TEXT = Option(
 )
 SEED = whole(0, MAX_SEED)
 COUNT = whole(1, MAX_COUNT, "all")
+AS_LOADED = "as the loader sees fit"
 BELOW_1 = Option("a number from 0 to below 1", lambda x: type(x) in (int, float) and 0 <= x < 1)
 AUSE_VARIANTS = [
     variant_name(of=of, error=error, pooled=pooled)
@@ -111,13 +112,16 @@ AUSE_VARIANTS = [
 
 _OPTIONS_OF_A_KIND = {
     "load.strict from_scratch train.random_background evaluation.scale_depth": FLAG,
-    "data_dir scene": TEXT,
+    "scene": TEXT,
+    "data_dir": default(TEXT, "$BAVS_DATA/<loader>"),
     # words
     "loader": choice(*LOADERS, "auto"),
-    "load.split": choice("", *SPLITS),
+    "load.split": default(choice(*SPLITS), AS_LOADED),
     "lpips_net": choice("", *NETS),
     "field_kind": choice(*SAMPLERS),
-    "sampler_kind": choice("", *sorted({*itertools.chain(*SAMPLERS.values())})),
+    "sampler_kind": default(
+        choice(*sorted({*itertools.chain(*SAMPLERS.values())})), "what suits field and scene"
+    ),
     "uncertainty.weighting": choice(*WEIGHTINGS),
     "uncertainty.variant": choice(*VARIANTS),
     "uncertainty.scale": choice(*SCALES),
@@ -125,8 +129,8 @@ _OPTIONS_OF_A_KIND = {
     "evaluation.variant": choice(*AUSE_VARIANTS),
     "evaluation.interval_scale": choice(*INTERVAL_SCALES),
     "candidates.source": choice("dataset", "hemisphere"),
-    "candidates.mode": choice("", *MODES),
-    "view_seed": Option(f"{SEED.wanted} as text, or '': each seed its own", _is_seed_text),
+    "candidates.mode": default(choice(*MODES), "the policy's own"),
+    "view_seed": default(SEED, "each seed its own"),
     # tuples
     "policies": several(choice(*POLICIES), 1, len(POLICIES)),
     "seeds": several(SEED, 1, 10_000),
@@ -134,12 +138,11 @@ _OPTIONS_OF_A_KIND = {
     "proposal.num_proposals": several(whole(1, 4096), 1, 8, distinct=False),
     "proposal.finest": several(whole(1, 65536), 1, 8, distinct=False),
     # counts of views, pixels and steps
-    "load.pool_size": Option(
-        "a share above 0 and below 1, a whole count up to 100000, or 0: as the loader sees fit",
-        _is_pool_size,
+    "load.pool_size": default(
+        Option("a share above 0 and below 1, a whole count up to 100000", _is_pool_size), AS_LOADED
     ),
-    "load.test_every": whole(2, 100_000, "as the loader sees fit"),
-    "load.downscale": whole(1, 1024, "as the loader sees fit"),
+    "load.test_every": default(whole(2, 100_000), AS_LOADED),
+    "load.downscale": default(whole(1, 1024), AS_LOADED),
     "load.seed": SEED,
     "image_size": whole(1, MAX_WIDTH, "as the files are"),
     "num_initial": views("all of the pool"),
@@ -175,7 +178,9 @@ _OPTIONS_OF_A_KIND = {
     "uncertainty.ensemble_size": whole(2, 64),
     # numbers
     "checkpoint_seconds train.roughness_weight": number(0.0, MAX_VALUE),
-    "candidates.min_train_distance candidates.min_candidate_distance": number(0.0, MAX_VALUE),
+    "candidates.min_train_distance candidates.min_candidate_distance": default(
+        positive(MAX_VALUE), "0.2 x the median camera distance"
+    ),
     "candidates.image_scale train.final_share train.adam_eps": positive(1.0),
     "hash_grid.initial_optical_depth": number(1e-6, 1e3),
     "flow_training.entropy_weight train.penalty_weight": number(0.0, 1e6),
@@ -184,22 +189,14 @@ _OPTIONS_OF_A_KIND = {
     "flow_training.floor uncertainty.offset_cells": positive(1e3),
     "proposal.far": positive(MAX_VALUE),
     "train.one_ray_share": number(0.0, 1.0),
-    "train.learning_rate": positive(1.0, "what suits the field kind"),
+    "train.learning_rate": default(positive(1.0), "what suits the field kind"),
     "train.max_grad_norm": positive(MAX_VALUE, "never cut"),
     "train.adam_b2": BELOW_1,
     "train.average_age": positive(0.5, "the last parameters"),
-    "uncertainty.prior_weight": positive(1e6, "1e-4 / (2^L)^3"),
+    "uncertainty.prior_weight": default(positive(1e6), "1e-4 / (2^L)^3"),
 }
 SCHEMA: dict[str, Option] = {
     name: option for names, option in _OPTIONS_OF_A_KIND.items() for name in names.split()
-}
-# What values were called, and what is read in place of it.
-OLD_VALUES = {
-    "uncertainty.weighting": {
-        "eq13": "gauss_newton",
-        "eq11": "residual_weighted",
-        "empirical": "empirical_fisher",
-    }
 }
 
 # --- checks ----------------------------------------------------------------------------------
@@ -238,7 +235,7 @@ def check_config(config: ConfigDict, *more: str, name: str = "config") -> Config
                 f"{name}.{group}.finest: is {finest}; give at least {group}.coarsest, {coarsest}"
             )
     given = [values[f"candidates.min_{what}_distance"] for what in ("train", "candidate")]
-    if 0.0 in given and any(given):
+    if given.count(None) == 1:
         raise ConfigError(
             f"{name}.candidates: give both min_train_distance and min_candidate_distance, "
             "or neither"
@@ -263,7 +260,7 @@ def check_options(config: ConfigDict, schema: dict[str, Option], name: str, old=
         if option not in values:
             raise ConfigError(f"{name}.{option}: is missing; give {wanted}")
         value, names = values[option], (old or {}).get(option, {})
-        if isinstance(value, str) and value in names:
+        if type(value) in (str, int, float) and value in names:
             values[option] = value = names[value]
             config.update_from_flattened_dict({option: value})
         if not fits(value):

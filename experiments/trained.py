@@ -23,7 +23,7 @@ from experiments import runtime
 from experiments.build import Problem, stream_key
 from experiments.build_model import KINDS, RENDER_CHUNK
 from experiments.configs import base
-from experiments.files import Part
+from experiments.files import Part, modern
 from experiments.runner import Run
 from experiments.runtime import WorkdirError
 from experiments.schema import check_config
@@ -110,10 +110,7 @@ def saved_config(workdir: pathlib.Path) -> ConfigDict:
     path = workdir / "config.json"
     config = base.get_config().lock()
     try:
-        saved = json.loads(path.read_text(encoding="utf-8"))
-        if "field" in saved:  # the group's name before
-            saved["hash_grid"] = saved.pop("field")
-        config.update(saved)
+        config.update(modern(json.loads(path.read_text(encoding="utf-8"))))
     except FileNotFoundError as error:
         raise WorkdirError(
             f"{path}: does not exist: give the --workdir of a run, or a --config to start one"

@@ -17,8 +17,9 @@ from experiments.bench.stages import check_sizes, default_sizes
 from experiments.build import check_views
 from experiments.configs import base, quickstart
 from experiments.configs.paper import protocols
+from experiments.files import OLD_VALUES
 from experiments.runtime import ConfigError
-from experiments.schema import FLAG, SCHEMA, TEXT, check_config, leaves
+from experiments.schema import FLAG, SCHEMA, check_config, leaves
 from experiments.suggestion import default_config
 from experiments.sweeps.plan import MAX_TRIALS, parse_axes
 from experiments.trained import saved_config
@@ -28,7 +29,7 @@ from tests.toy_scenes import toy_scene
 # Refused by every option, whatever it is.
 BAD = (
     *(math.nan, math.inf, -math.inf, -1, -0.5, 10**12, 1e300, -(10**5000), 10**5000, 1j),
-    *(None, b"bytes", [], [1], {}, {"a": 1}, {1}, object(), int),
+    *(b"bytes", [], [1], {}, {"a": 1}, {1}, object(), int),
     *((), ((),), (((1,),),), (math.nan,), (-1,), (True,), ("",), (None,), (10**12,), ("nonsense",)),
     *("\0", "a\nb", "\x1b[2J", "\udcff", "x" * 5000),
 )
@@ -40,9 +41,17 @@ ZERO_IS_FINE = {
     *("proposal.distortion_weight", "proposal.penalty_weight", "train.learning_rate"),
     *("train.warmup_steps", "train.max_grad_norm", "train.adam_b2", "train.penalty_weight"),
     *("train.average_age", "train.roughness_weight", "train.look_ahead", "train.one_ray_share"),
-    *("uncertainty.prior_weight", "uncertainty.max_rays", "evaluation.num_views"),
+    *("view_seed", "uncertainty.prior_weight", "uncertainty.max_rays", "evaluation.num_views"),
     *("evaluation.num_interval_views", "evaluation.num_interval_pixels"),
     *("candidates.min_train_distance", "candidates.min_candidate_distance"),
+}
+
+
+# None stands for what is best by default.
+NONE_IS_FINE = {
+    *("data_dir", "load.downscale", "load.pool_size", "load.test_every", "load.split"),
+    *("view_seed", "sampler_kind", "train.learning_rate", "uncertainty.prior_weight"),
+    *("candidates.mode", "candidates.min_train_distance", "candidates.min_candidate_distance"),
 }
 
 
@@ -94,7 +103,9 @@ def test_every_bad_value_of_every_option_is_refused(option):
         if isinstance(value, dict):
             continue  # it becomes a group: see below
         assert refusal(option, value).startswith(f"config.{option}: is "), value
-    words = SCHEMA[option] is TEXT or isinstance(base_value(option), str)
+    if option not in NONE_IS_FINE:
+        refusal(option, None)
+    words = type_of(option) is str
     for value in (True, False) if SCHEMA[option] is not FLAG else (0, 1, "True"):
         refusal(option, value)
     for value in ("1", "nonsense ") if not words else (1, 1.0):
@@ -106,11 +117,21 @@ def test_every_bad_value_of_every_option_is_refused(option):
         refusal(option, 0.0)
 
 
+def test_where_nothing_is_given_the_default_is_none():
+    values = leaves(base.get_config())
+    assert {option for option, value in values.items() if value is None} == NONE_IS_FINE
+    for option in NONE_IS_FINE:
+        config = base.get_config()
+        for old in OLD_VALUES[option]:
+            assert leaves(check_config(with_value(option, old, config)))[option] is None
+
+
 DRAWN = {"candidates__source": "hemisphere", "candidates__hemisphere_draws": 100}
 
 
-def base_value(option):
-    return leaves(base.get_config())[option]
+def type_of(option):
+    *groups, name = option.split(".")
+    return reduce(getitem, groups, base.get_config()).get_type(name)
 
 
 def test_an_option_that_is_a_group_or_missing_or_unknown_is_named():
@@ -132,7 +153,7 @@ def test_an_option_that_is_a_group_or_missing_or_unknown_is_named():
         ("uncertainty.log2_cells", 12, "is 12; give a whole number from 1 to 9 \\(a grid of 2\\^9"),
         ("image_size", 100_000, "is 100000; give a whole number from 1 to 8,192, or 0: as the"),
         ("candidates.image_scale", -1.0, r"is -1\.0; give a number above 0 to 1"),
-        ("view_seed", "4294967296", "is '4294967296'; give a whole number from 0 to 4,294,967,295"),
+        ("view_seed", 2**32, "is 4294967296; give a whole number from 0 to 4,294,967,295, or None"),
         ("lpips_net", "nonsense", "is 'nonsense'; give one of '', 'alex', 'vgg'"),
         ("uncertainty.weighting", "eq12", "is 'eq12'; give one of "),
         ("policies", ("bavs", "bavs"), "each once"),
@@ -240,7 +261,10 @@ def test_old_names_are_read_as_the_new_ones(old, new):
 def test_a_run_saved_under_the_old_names_is_read(tmp_path):
     saved = base.get_config().to_dict()
     saved["field"] = saved.pop("hash_grid") | {"finest": 64}
-    saved["uncertainty"]["weighting"] = "eq11"
+    saved["uncertainty"] |= {"weighting": "eq11", "prior_weight": 0.0}
+    saved |= {"view_seed": "3", "sampler_kind": ""}
     (tmp_path / "config.json").write_text(json.dumps(saved))
     config = saved_config(tmp_path)
     assert (config.hash_grid.finest, config.uncertainty.weighting) == (64, "residual_weighted")
+    assert (config.view_seed, config.sampler_kind) == (3, None)
+    assert config.uncertainty.prior_weight is None

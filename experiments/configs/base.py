@@ -1,6 +1,7 @@
 """Every option of an active-selection run, with its default and what it means."""
 
 from ml_collections import ConfigDict
+from ml_collections.config_dict import placeholder  # None, with a type
 
 
 def get_config() -> ConfigDict:
@@ -8,24 +9,24 @@ def get_config() -> ConfigDict:
 
     # --- the scene ---
     config.loader = "procedural"  # a key of bavs_jax.scenes.LOADERS
-    config.data_dir = ""  # folder of scenes; empty: $BAVS_DATA/<loader>
+    config.data_dir = placeholder(str)  # folder of scenes; None: $BAVS_DATA/<loader>
     config.scene = "sculpture"  # folder in data_dir (the procedural scene has just this one)
     config.image_size = 100  # pixels of the image width; 0: as the files are
 
-    # --- how its files are read (bavs_jax/scenes); 0 or False: as the loader sees fit ---
+    # --- how its files are read (bavs_jax/scenes); None: as the loader sees fit ---
     config.load = ConfigDict()
     config.load.strict = False  # whether a listed image without a file is an error, or a warning
-    config.load.downscale = 0  # N reads the images of the folder images_N
-    config.load.pool_size = 0.0  # views that may be trained on: a count, or a share below 1
-    config.load.test_every = 0  # instead: every so many-th view is a test view
+    config.load.downscale = placeholder(int)  # N reads the images of the folder images_N
+    config.load.pool_size = placeholder(float)  # views to train on: a count, or a share below 1
+    config.load.test_every = placeholder(int)  # instead: every so many-th view is a test view
     config.load.seed = 0  # draws the pool
-    config.load.split = ""  # loader "lightfield": a published split; see scenes/lightfield.py
+    config.load.split = placeholder(str)  # of loader "lightfield"; see scenes/lightfield.py
 
     # --- the experiment ---
     config.policies = ("bavs", "random")  # see --list_policies; the first one's views are exported
     config.seeds = (0,)
     config.num_initial = 4  # views, drawn from the pool by seed and scene alone; 0: all of them
-    config.view_seed = ""  # a seed whose initial views all others begin with; "": each its own
+    config.view_seed = placeholder(int)  # whose initial views all begin with; None: each its own
     config.batch_size = 4  # views chosen at once
     config.num_rounds = 2  # batches after the initial views; 1 is the paper's single iteration
     config.from_scratch = True  # train anew in each round, or train on
@@ -37,8 +38,8 @@ def get_config() -> ConfigDict:
 
     # --- the field and how rays are sampled for it ---
     config.field_kind = "hash_grid"  # a key of build_model.SAMPLERS
-    # "occupancy", "proposal" or "coarse_to_fine"; "": what suits field and scene.
-    config.sampler_kind = ""
+    # "occupancy", "proposal" or "coarse_to_fine"; None: what suits field and scene.
+    config.sampler_kind = placeholder(str)
 
     # Rays through each pixel, whose mean is its colour, in training and on test views: 1, 4 or 9.
     config.rays_per_pixel = 4
@@ -117,7 +118,7 @@ def get_config() -> ConfigDict:
     config.train.one_ray_share = 0.5  # of a round's steps, the first, with one ray for each pixel
     config.train.look_ahead = 2  # times as many are looked at, to leave out hidden ones; 0: never
     config.train.random_background = True  # for each ray, where photos have alpha
-    config.train.learning_rate = 0.0  # 0: what suits the field kind
+    config.train.learning_rate = placeholder(float)  # None: what suits the field kind
     config.train.final_share = 0.1  # of the learning rate, at the end of a round
     config.train.warmup_steps = 32  # until the learning rate has its full height
     config.train.max_grad_norm = 0.0  # longer gradients are cut to this; 0: never
@@ -131,7 +132,7 @@ def get_config() -> ConfigDict:
     # --- uncertainty (bavs_jax/uncertainty) ---
     config.uncertainty = ConfigDict()
     config.uncertainty.log2_cells = 6  # L: a grid of 2^L cells per side
-    config.uncertainty.prior_weight = 0.0  # lambda, of thirds of the box; 0: 1e-4 / (2^L)^3
+    config.uncertainty.prior_weight = placeholder(float)  # lambda; None: 1e-4 / (2^L)^3
     config.uncertainty.weighting = (
         "gauss_newton"  # "gauss_newton", "residual_weighted" or "empirical_fisher"
     )
@@ -162,8 +163,9 @@ def get_config() -> ConfigDict:
     config.candidates.source = "dataset"  # "dataset" or "hemisphere" (Eq 14)
     config.candidates.hemisphere_draws = 100
     config.candidates.image_scale = 0.25  # of width and height, for the score (Eq 15)
-    config.candidates.mode = ""  # "top_k", "greedy" or "" for the policy's own
-    config.candidates.min_train_distance = 0.0  # scene units; 0: 0.2 x median camera distance
-    config.candidates.min_candidate_distance = 0.0
+    config.candidates.mode = placeholder(str)  # "top_k", "greedy"; None: the policy's own
+    # Of the max-min distance filter, scene units; None: 0.2 x median camera distance.
+    config.candidates.min_train_distance = placeholder(float)
+    config.candidates.min_candidate_distance = placeholder(float)
 
     return config

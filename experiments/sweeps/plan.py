@@ -5,8 +5,10 @@ from __future__ import annotations
 import ast
 import copy
 import dataclasses
+import functools
 import itertools
 import math
+import operator
 import pathlib
 import re
 from collections.abc import Sequence
@@ -50,7 +52,7 @@ def parse_axes(texts: Sequence[str], config, changes: Sequence[str] = ()) -> Axe
       ConfigError: an axis that is unknown, given twice or empty, a value of another type, or more
         than `MAX_TRIALS` in all.
     """
-    known = {f"config.{name}": value for name, value in leaves(config).items()}
+    known = {f"config.{name}": _example(config, name) for name in leaves(config)}
     own: dict[str, tuple] = {"policy": tuple(config.policies), "seed": tuple(config.seeds)}
     options, alone, seen = [], [], []
     for flag, text in [("axis", t) for t in texts] + [("change", t) for t in changes]:
@@ -84,6 +86,13 @@ def parse_axes(texts: Sequence[str], config, changes: Sequence[str] = ()) -> Axe
     rows = itertools.product(*options, [{}, *alone])
     settings = [{name: v for part in row for name, v in part.items()} for row in rows]
     return Axes(policies, seeds, settings)
+
+
+def _example(config, name: str):
+    """The value of an option, or where that is None another of its type."""
+    *groups, last = name.split(".")
+    group = functools.reduce(operator.getitem, groups, config)
+    return group.get_type(last)() if group[last] is None else group[last]
 
 
 def _parse(text: str, known: dict[str, Any]) -> tuple[list[str], list[tuple]]:
