@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from bavs_jax.cameras import Cameras, image_pixels, look_at, pixel_rays, take
 from bavs_jax.scenes import load_nerfstudio
 from bavs_jax.scenes.base import Scene, photo_cameras
+from experiments.choices import CAMERA_FIELDS, write_next_views
 from experiments.reporting.suggestion import write_poses
-from experiments.runner import CAMERA_FIELDS, write_next_views
 from tests.scene_files import edit_json, random_image, write_nerfstudio
 
 WIDTH, HEIGHT = 24, 16

@@ -22,6 +22,7 @@ from bavs_jax.scenes import Scene
 from bavs_jax.scenes.poses import scene_points, user_points, user_transforms, user_units
 from bavs_jax.selection.route import route_length, shortest_route
 from bavs_jax.selection.worth import Worth
+from experiments.choices import nerfstudio_frames, write_frames
 from experiments.evaluate import render_with_bar
 from experiments.files import read_json, write_atomic, write_json
 from experiments.reporting import plots
@@ -35,7 +36,6 @@ from experiments.reporting.pictures import (
     uncertainty_limits,
 )
 from experiments.reporting.tables import Cell, Table, dash
-from experiments.runner import nerfstudio_frames, write_frames
 from experiments.runtime import command_line, device_name, peak_memory_mb, versions, warn
 from experiments.suggestion import Options, Suggestion, in_matter
 from experiments.trained import TrainedRun
