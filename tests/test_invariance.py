@@ -21,6 +21,7 @@ from bavs_jax.selection.batch import acquire
 from bavs_jax.selection.context import make_context
 from bavs_jax.selection.policies import POLICIES
 from bavs_jax.training.train import TrainState
+from bavs_jax.uncertainty.channel import make_render_chunk_fn
 from bavs_jax.uncertainty.images import make_image_fn
 from bavs_jax.uncertainty.measures import make_true_error_fn
 from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE, Acquired
@@ -121,10 +122,19 @@ class World:
             group_size=setup.curvature.group_size,
             track=silent,
         )
+        laplace = setup.laplace
+        render_chunk = make_render_chunk_fn(
+            models[RECONSTRUCTION],
+            setup.grid,
+            variant=laplace.variant,
+            scale=laplace.scale,
+            extent=laplace.extent,
+        )
         self.setup = setup = setup._replace(
             models=models,
             flow=flow,
             curvature=curvature,
+            render_chunk=render_chunk,
             train=toy_train,
             image_scale=1.0,
             chunk=256,
