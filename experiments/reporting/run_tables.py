@@ -152,7 +152,10 @@ def choices_table(run: Run, acquisition: dict[str, np.ndarray]) -> Table:
         ]
         rows.append([number, *("—" if n is None else n for n in numbers), ", ".join(chosen)])
     head = ("round", "candidates", "left by the distance filter", "farthest-view would share")
-    return Table((*head, "gain / most that a batch can gain", "chosen (score)"), rows)
+    head = (*head, "gain / most that a batch can gain", "chosen (score)")
+    # Without what this policy has in no round.
+    kept = [i for i in range(len(head)) if not rows or any(row[i] != "—" for row in rows)]
+    return Table(tuple(head[i] for i in kept), [[row[i] for i in kept] for row in rows])
 
 
 # --- settings of a sweep ---
