@@ -124,7 +124,7 @@ def measure_test_views(problem, train, num: int, label: str) -> dict:
     """`evaluate_views` of a trained field on `num` test views (0: all), with progress."""
     scene, rays_per_pixel = problem.scene, problem.config.rays_per_pixel
     view_ids = evenly_spaced(scene.test, num)
-    num_rays = rays_per_pixel * int(sum(np.diff(scene.offsets)[view_ids]))
+    num_rays = rays_per_pixel * int(num_pixels(scene.cameras)[view_ids].sum())
     with track(num_rays, f"{label}: {len(view_ids)} test views", "rays") as bar:
         return evaluate_views(
             problem.render(train),

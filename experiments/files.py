@@ -296,18 +296,24 @@ OLD_VALUES: dict[str, dict] = {
 }
 
 
+def modern_value(option: str, value):
+    """What is read in place of an option's value, for most values that itself."""
+    is_word = type(value) in (str, int, float)  # True and False are no old names of 1 and 0
+    return OLD_VALUES.get(option, {}).get(value, value) if is_word else value
+
+
 def modern(saved: dict) -> dict:
     """A `config.json` of an earlier version in the words of this one."""
     saved = copy.deepcopy(saved)
     if "field" in saved:
         saved["hash_grid"] = saved.pop("field")
-    for option, names in OLD_VALUES.items():
+    for option in OLD_VALUES:
         *groups, name = option.split(".")
         group = saved
         for part in groups:
             group = group.get(part, {})
-        if name in group and type(group[name]) in (str, int, float):
-            group[name] = names.get(group[name], group[name])
+        if name in group:
+            group[name] = modern_value(option, group[name])
     if type(saved.get("view_seed")) is str:  # a seed was written as text
         saved["view_seed"] = int(saved["view_seed"])
     return saved

@@ -21,7 +21,7 @@ from bavs_jax.uncertainty.conformal_scale import SCALES as INTERVAL_SCALES
 from bavs_jax.uncertainty.curvature import WEIGHTINGS
 from bavs_jax.uncertainty.models import MODELS
 from experiments.build_model import SAMPLERS
-from experiments.files import OLD_VALUES, leaves
+from experiments.files import leaves, modern_value
 from experiments.runtime import ConfigError, one_line, shown
 
 MAX_SEED = 2**32 - 1  # a larger one is the key of another seed, or none
@@ -227,7 +227,7 @@ def check_config(config: ConfigDict, *more: str, name: str = "config") -> Config
       ConfigError: the first option that cannot be used.
     """
     schema = SCHEMA | {option: views("none") for option in more}
-    values = check_options(config, schema, name, OLD_VALUES)
+    values = check_options(config, schema, name)
     for group in ("hash_grid", "proposal"):
         coarsest, finest = values[f"{group}.coarsest"], values[f"{group}.finest"]
         if min(finest if isinstance(finest, tuple) else (finest,)) < coarsest:
@@ -243,12 +243,12 @@ def check_config(config: ConfigDict, *more: str, name: str = "config") -> Config
     return config
 
 
-def check_options(config: ConfigDict, schema: dict[str, Option], name: str, old=None) -> dict:
+def check_options(config: ConfigDict, schema: dict[str, Option], name: str) -> dict:
     """The options of a config by their dotted names, each checked by itself.
 
-    `name` is what errors call the config; `old` has, by option, old names of values and the new
-    ones, which are put in their place. Raises ConfigError for an option that cannot be used, is
-    missing or is not in the schema.
+    `name` is what errors call the config. What earlier versions called a value is replaced by what
+    this one does. Raises ConfigError for an option that cannot be used, is missing or is not in the
+    schema.
     """
     if not isinstance(getattr(config, "items", None), Callable):
         raise ConfigError(f"--{name}: get_config() returns {shown(config)}; return a ConfigDict")
@@ -259,9 +259,9 @@ def check_options(config: ConfigDict, schema: dict[str, Option], name: str, old=
     for option, (wanted, fits) in schema.items():
         if option not in values:
             raise ConfigError(f"{name}.{option}: is missing; give {wanted}")
-        value, names = values[option], (old or {}).get(option, {})
-        if type(value) in (str, int, float) and value in names:
-            values[option] = value = names[value]
+        value = modern_value(option, values[option])
+        if value is not values[option]:
+            values[option] = value
             config.update_from_flattened_dict({option: value})
         if not fits(value):
             raise ConfigError(f"{name}.{option}: is {shown(value)}; give {wanted}")

@@ -21,8 +21,9 @@ from bavs_jax.policy_inputs import make_candidate_curvature_fn
 from bavs_jax.scenes import Scene, SceneError
 from bavs_jax.scenes.pose_files import read_pose_file
 from bavs_jax.scenes.poses import scene_points, transform_poses, user_points, user_units
+from bavs_jax.selection import SelectionError
 from bavs_jax.selection.batch import SelectionInfo, acquire
-from bavs_jax.selection.context import SelectionError, make_context
+from bavs_jax.selection.context import make_context
 from bavs_jax.selection.information import (
     Information,
     add_curvature,
