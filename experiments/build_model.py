@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -34,6 +35,10 @@ from experiments.runtime import track as show_progress
 
 KINDS = (RECONSTRUCTION, VARIANCE, FLOW)
 RENDER_CHUNK = 4096  # rays of one compiled rendering call
+RENDER_CAPACITY = 2 * RENDER_CHUNK  # samples of one of its passes: rays of a trained field need 3
+SHARES = (0.25, 0.5, 0.75, 1.0)  # of the sample buffer, for steps with fewer samples
+SPARE = 1.1  # times the places that one batch needs are enough for the next ones
+YOUNG = 256  # steps, in which a field changes too fast to say what the next ones need
 # What can sample each kind of field; the first that suits the scene is the default.
 SAMPLERS = {
     "hash_grid": ("occupancy", "proposal"),
@@ -180,18 +185,18 @@ def build_model(
             f"config.train.capacity: {capacity} samples of a device cannot hold the "
             f"{sampler.num_slots} of one ray (config.march.num_slots): give more"
         )
-    buffer = {"capacity": capacity, "mesh": mesh}
     if kind == FLOW:
         field = flow_field.mean_field(flow)
-        objective = objectives.make_flow_objective(flow, **buffer, **config.flow_training)
+        objective = objectives.make_flow_objective(flow, mesh=mesh, **config.flow_training)
     elif kind == VARIANCE:
-        objective = objectives.make_variance_objective(field, **buffer)
+        objective = objectives.make_variance_objective(field, mesh=mesh)
     else:
-        objective = objectives.make_colour_objective(field, **buffer)
+        objective = objectives.make_colour_objective(field, mesh=mesh)
     training = RayTraining(
         objective,
+        capacity=capacity,
         rays_per_pixel=config.rays_per_pixel,
-        capacity_before_hiding=train.look_ahead * capacity,
+        look_ahead=train.look_ahead,
         **only(train, "num_rays", "random_background", "penalty_weight", "roughness_weight"),
     )
     return RayField(
@@ -199,17 +204,33 @@ def build_model(
         sampler,
         background=_background(scene),
         box=None if scene.unbounded else scene.box,
-        capacity=8 * RENDER_CHUNK // num_shards(mesh),
+        capacity=RENDER_CAPACITY // num_shards(mesh),
         training=training,
         mesh=mesh,
     )
+
+
+def fitting_capacity(needed: int, capacity: int, most_points: int) -> int:
+    """The smallest of a few shares of a sample buffer that a training step needs.
+
+    Args:
+      needed: places that the samples of one batch take (`RayField.places_needed`).
+      capacity: of the whole buffer, which is used where no smaller one is enough.
+      most_points: samples of one ray, which any buffer must hold.
+    """
+    sizes = [round(share * capacity) for share in SHARES]
+    enough = max(SPARE * needed, most_points)
+    return next((size for size in sizes if size >= enough), capacity)
 
 
 def build_trainer(config, model: RayField) -> Trainer:
     """How a model is trained in each round of a config.
 
     At first one ray goes through each pixel, so that a step sees as many pixels as rays; then
-    `config.rays_per_pixel`, whose mean is what a photo shows.
+    `config.rays_per_pixel`, whose mean is what a photo shows. Work goes with the size of the sample
+    buffer, not with what is in it: once few samples are left to evaluate, a smaller one is used.
+    Which, is asked of the field before each compiled call, so that training that was stopped goes
+    on the same way.
     """
     train = config.train
     learning_rate = train.learning_rate
@@ -223,23 +244,33 @@ def build_trainer(config, model: RayField) -> Trainer:
         **only(train, "final_share", "num_steps", "max_grad_norm"),
     )
 
-    def call_of(rays_per_pixel: int):
-        training = model.training._replace(rays_per_pixel=rays_per_pixel)
+    @functools.cache
+    def looking(rays_per_pixel: int, capacity: int) -> RayField:
+        training = {"rays_per_pixel": rays_per_pixel, "capacity": capacity}
+        return dataclasses.replace(model, training=model.training._replace(**training))
+
+    @functools.cache
+    def steps(rays_per_pixel: int, capacity: int):
         return make_train_fn(
-            dataclasses.replace(model, training=training),
+            looking(rays_per_pixel, capacity),
             optimiser,
             schedule,
             mesh=model.mesh,
             **only(train, "average_age", "steps_per_call"),
         )
 
-    call = later = call_of(config.rays_per_pixel)
-    if config.rays_per_pixel > 1:
-        first, num_first = call_of(1), train.one_ray_share * train.num_steps
+    @functools.cache
+    def places(rays_per_pixel: int):
+        return jax.jit(looking(rays_per_pixel, model.training.capacity).places_needed)
 
-        def call(key, state, table, is_training_view):
-            this = first if int(state.step) < num_first else later
-            return this(key, state, table, is_training_view)
+    def call(key, state, table, is_training_view):
+        one_ray = int(state.step) < train.one_ray_share * train.num_steps
+        rays_per_pixel = 1 if one_ray else config.rays_per_pixel
+        capacity = model.training.capacity
+        if int(state.step) >= YOUNG and not model.sampler.dense:
+            needed = places(rays_per_pixel)(key, state.model, table, is_training_view)
+            capacity = fitting_capacity(int(needed), capacity, model.most_points)
+        return steps(rays_per_pixel, capacity)(key, state, table, is_training_view)
 
     fresh = jax.jit(partial(init_train_state, model=model, optimiser=optimiser))
     num_calls = -(-train.num_steps // train.steps_per_call)

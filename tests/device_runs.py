@@ -67,7 +67,7 @@ def main(out):
         scene.box, near=scene.near, far=scene.far, num_steps=32, num_slots=24
     )
     sampler = make_occupancy_sampler(scene.box, march, resolution=8)
-    shared = {"capacity": CAPACITY // shards, "mesh": mesh}
+    capacity = CAPACITY // shards
     field = make_hash_grid_field(scene.box, HASH)
     with_variance = make_hash_grid_field(scene.box, HASH, learned_variance=True)
     flow = make_flow_field(scene.box, HASH, FlowOptions(condition_features=8, num_flows=2))
@@ -79,13 +79,13 @@ def main(out):
         num_samples=8,
     )
     jobs = {
-        "colour": (field, sampler, make_colour_objective(field, **shared)),
-        "proposals": (field, proposals, make_colour_objective(field, **shared)),
-        "variance": (with_variance, sampler, make_variance_objective(with_variance, **shared)),
+        "colour": (field, sampler, make_colour_objective(field, mesh=mesh)),
+        "proposals": (field, proposals, make_colour_objective(field, mesh=mesh)),
+        "variance": (with_variance, sampler, make_variance_objective(with_variance, mesh=mesh)),
         "flow": (
             mean_field(flow),
             sampler,
-            make_flow_objective(flow, **shared, num_draws=2, floor=0.01),
+            make_flow_objective(flow, mesh=mesh, num_draws=2, floor=0.01),
         ),
     }
     found = {}
@@ -95,8 +95,11 @@ def main(out):
             its_sampler,
             background=scene.background,
             box=scene.box,
-            training=RayTraining(objective, num_rays=NUM_RAYS, penalty_weight=0.1),
-            **shared,
+            training=RayTraining(
+                objective, num_rays=NUM_RAYS, capacity=capacity, penalty_weight=0.1
+            ),
+            capacity=capacity,
+            mesh=mesh,
         )
         for name, (trained, its_sampler, objective) in jobs.items()
     }

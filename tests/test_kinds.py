@@ -11,7 +11,15 @@ from bavs_jax.fields.hash_grid import HashGridOptions, make_hash_grid_field
 from bavs_jax.pixel_table import make_pixel_table
 from bavs_jax.rendering.samplers import dense_samples
 from experiments.build import Problem
-from experiments.build_model import KINDS, build_flow, build_model, build_trainer
+from experiments.build_model import (
+    KINDS,
+    SPARE,
+    YOUNG,
+    build_flow,
+    build_model,
+    build_trainer,
+    fitting_capacity,
+)
 from experiments.runtime import ConfigError
 from tests.toy_fields import rays_through
 from tests.toy_rounds import run_round, silent, start
@@ -120,9 +128,49 @@ def test_every_kind_of_training_fits_every_network(field_kind, kind):
     trainer = build_trainer(config, model)
     state = jax.eval_shape(trainer.init, KEY)
     table = make_pixel_table(scene)
-    after, info = jax.eval_shape(trainer.call, KEY, state, table, np.ones(scene.num_views, bool))
+    mask = np.ones(scene.num_views, bool)
+
+    def first_call(state):  # whose step is known while it is traced
+        return trainer.call(KEY, state.replace(step=np.int32(0)), table, mask)
+
+    after, info = jax.eval_shape(first_call, state)
     assert jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, state)
     assert info.loss.shape == ()
+
+
+@pytest.mark.parametrize(
+    "needed, size",
+    [(0, 200), (1, 200), (181, 200), (182, 400), (363, 400), (545, 600), (546, 800), (999, 800)],
+)
+def test_a_buffer_is_the_smallest_share_with_room_to_spare(needed, size):
+    assert fitting_capacity(needed, 800, most_points=24) == size
+    assert fitting_capacity(needed, 800, most_points=500) == max(size, 600)
+
+
+def test_a_field_with_few_samples_trains_the_same_in_a_smaller_buffer():
+    """And once it is older only: a young one changes too fast."""
+    scene, table = toy_scene(), make_pixel_table(toy_scene())
+    mask, ends, programs = np.ones(scene.num_views, bool), [], []
+
+    def problem_with(capacity):
+        config = toy_config(loader="blender", train__num_rays=32, train__capacity=capacity)
+        return Problem(config, scene)
+
+    whole = problem_with(4096)
+    state = whole.trainer.init(KEY)
+    needed = int(jax.jit(whole.model.places_needed)(KEY, state.model, table, mask))
+    just_enough = int(np.ceil(SPARE * needed))
+    for capacity in (just_enough, 4 * just_enough):
+        trainer = problem_with(capacity).trainer
+        with count_traces() as young:
+            trainer.call(KEY, jax.tree.map(jnp.copy, state), table, mask)
+        old_state = jax.tree.map(jnp.copy, state.replace(step=jnp.int32(YOUNG)))
+        with count_traces() as old:
+            ends.append(trainer.call(KEY, old_state, table, mask))
+        programs.append((young.count("train"), old.count("train")))
+    assert programs == [(1, 0), (1, 1)]
+    assert ends[0][1].rays == 32
+    jax.tree.map(np.testing.assert_array_equal, *ends)
 
 
 def test_one_ray_a_pixel_comes_first_and_several_later():

@@ -67,14 +67,14 @@ def trainer():
 
 def make_model(scene, field, sampler, *, capacity=1024, **options):
     """A field with how it is trained; the options are those of `RayTraining`."""
-    objective = make_colour_objective(field, capacity=capacity)
+    objective = make_colour_objective(field)
     return RayField(
         field,
         sampler,
         background=scene.background,
         box=scene.box,
         capacity=1024,
-        training=RayTraining(objective, num_rays=64, **options),
+        training=RayTraining(objective, num_rays=64, capacity=capacity, **options),
     )
 
 
@@ -171,7 +171,8 @@ def test_the_loss_compares_the_mean_of_a_pixel_s_rays_and_leaves_out_pixels_that
     counts = np.asarray(samples.sample_mask.sum(-1)).reshape(-1, 4)
     cut = next(p for p in range(4, 16) if counts[p, 1] and counts[p, 2])
     capacity = int(counts[:cut].sum() + counts[cut, :2].sum())  # half of that pixel's rays fit
-    outcome = jax.jit(make_colour_objective(field, capacity=capacity))(None, params, batch, samples)
+    objective = partial(make_colour_objective(field), capacity=capacity)
+    outcome = jax.jit(objective)(None, params, batch, samples)
     render = jax.jit(
         partial(
             render_rays,
@@ -270,7 +271,7 @@ def test_roughness_is_the_variation_of_dense_levels_and_counts_by_training_pixel
 
 @pytest.mark.parametrize(
     "options",
-    [{"capacity": 1}, {"capacity": 2048, "capacity_before_hiding": 1}],
+    [{"capacity": 1}, {"capacity": 1, "look_ahead": 1}],
     ids=["not fitted", "not looked at"],
 )
 def test_rays_that_were_left_out_do_not_count_in_the_loss(trainer, options):
@@ -293,17 +294,17 @@ def test_leaving_out_hidden_samples_trains_the_same_with_fewer_of_them(trainer):
     thick_model = make_model(scene, thick, model.sampler)
     start = init_train_state(jax.random.key(0), thick_model, optax.sgd(1.0))
     found = {}
-    for looked_at in (0, 2048):
+    for look_ahead in (0, 1):
         train = make_train(
             (scene, thick_model),
             optax.sgd(1.0),
             lambda step: 1.0,
             capacity=2048,
-            capacity_before_hiding=looked_at,
+            look_ahead=look_ahead,
         )
         state, info = train(jax.random.key(1), jax.tree.map(jnp.copy, start), table, mask)
-        found[looked_at] = state.model.params["field"], info
-    (params, info), (wanted, whole) = found[2048], found[0]
+        found[look_ahead] = state.model.params["field"], info
+    (params, info), (wanted, whole) = found[1], found[0]
     assert info.rays == whole.rays == 64 and info.samples < 0.5 * whole.samples
     assert whole.loss > 0.01
     np.testing.assert_allclose(info.loss, whole.loss, rtol=1e-2)
@@ -312,6 +313,28 @@ def test_leaving_out_hidden_samples_trains_the_same_with_fewer_of_them(trainer):
     )
     off = optax.global_norm(jax.tree.map(jnp.subtract, moved, wanted))
     assert off < 0.1 * optax.global_norm(wanted)
+
+
+@pytest.mark.parametrize("look_ahead", [0, 2])
+def test_the_places_that_a_step_needs_are_the_least_that_leave_out_no_ray(trainer, look_ahead):
+    scene, model, *_ = trainer
+    table, mask = make_pixel_table(scene), jnp.arange(scene.num_views) < 4
+    thick = make_hash_grid_field(
+        scene.box, HashGridOptions(num_levels=1, finest=8, width=16, initial_optical_depth=4.0)
+    )
+    key, state = jax.random.key(5), make_model(scene, thick, model.sampler).init(jax.random.key(0))
+
+    def rays(capacity):
+        options = {"capacity": capacity, "look_ahead": look_ahead}
+        step = jax.jit(make_model(scene, thick, model.sampler, **options).loss)
+        return int(step(key, state, table, mask)[1].rays)
+
+    whole = make_model(scene, thick, model.sampler, capacity=4096, look_ahead=look_ahead)
+    needed = int(jax.jit(whole.places_needed)(key, state, table, mask))
+    assert rays(needed) == 64 and rays(needed - 1) < 64
+    if look_ahead:  # what is hidden needs no place, once it has been looked at
+        alone = make_model(scene, thick, model.sampler, capacity=4096)
+        assert needed < int(jax.jit(alone.places_needed)(key, state, table, mask))
 
 
 def test_training_is_deterministic(trainer):

@@ -4,7 +4,6 @@ An `Objective` is a pure function of a field's parameters. The samples' own loss
 penalty are added by `ray_field.py`.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple, Protocol
 
@@ -33,16 +32,32 @@ class Outcome(NamedTuple):
 
 
 class Objective(Protocol):
-    """The loss of a field's parameters on a batch of pixels, whose R rays are seen at [R, S]."""
+    """The loss of a field's parameters on a batch of pixels, whose R rays are seen at [R, S].
+
+    `capacity` are the places of each device's buffer for valid samples; a dense sampler needs none.
+    """
 
     def __call__(
-        self, key: jax.Array, params: Params, batch: PixelBatch, samples: Samples, /
+        self,
+        key: jax.Array,
+        params: Params,
+        batch: PixelBatch,
+        samples: Samples,
+        /,
+        *,
+        capacity: int,
     ) -> Outcome: ...
 
 
 def _render_batch(
-    field: Field, capacity: int, mesh: Mesh | None
-) -> Callable[[Params, PixelBatch, Samples], RayRendering]:
+    field: Field,
+    mesh: Mesh | None,
+    params: Params,
+    batch: PixelBatch,
+    samples: Samples,
+    *,
+    capacity: int,
+) -> RayRendering:
     def render(params: Params, batch: PixelBatch, samples: Samples) -> RayRendering:
         return render_rays(
             batch.rays,
@@ -54,21 +69,19 @@ def _render_batch(
             inputs=field.inputs(batch.rays, samples, batch.view_ids),
         )
 
-    return over_rays(render, mesh, sharded=(False, True, True))
+    return over_rays(render, mesh, sharded=(False, True, True))(params, batch, samples)
 
 
-def make_colour_objective(field: Field, *, capacity: int, mesh: Mesh | None = None) -> Objective:
+def make_colour_objective(field: Field, *, mesh: Mesh | None = None) -> Objective:
     """Mean squared colour error (Eq 5).
 
     Args:
-      capacity: places of each device's buffer for valid samples; a dense sampler needs none.
       mesh: devices that share the rays (see `devices.py`).
     """
-    render = _render_batch(field, capacity, mesh)
 
-    def objective(key, params, batch, samples):
+    def objective(key, params, batch, samples, *, capacity):
         del key
-        out = render(params, batch, samples)
+        out = _render_batch(field, mesh, params, batch, samples, capacity=capacity)
         rgb = batch.mean(out.rgb)
         loss = colour_loss(rgb, batch.rgb, batch.pixel_weight * batch.whole(out.ray_mask))
         return Outcome(loss, rgb, out.weights, out.ray_mask)
@@ -79,7 +92,6 @@ def make_colour_objective(field: Field, *, capacity: int, mesh: Mesh | None = No
 def make_variance_objective(
     field: Field,
     *,
-    capacity: int,
     density_weight: float = 0.01,
     through_weights: bool = False,
     mesh: Mesh | None = None,
@@ -97,15 +109,14 @@ def make_variance_objective(
 
     Args:
       field: one whose `apply` also returns `beta`.
-      capacity, mesh: see `make_colour_objective`.
       density_weight: of the mean density over all slots, which keeps empty space empty.
       through_weights: whether the geometry is moved to make U likelier too, as published.
+      mesh: see `make_colour_objective`.
     """
-    render = _render_batch(field, capacity, mesh)
 
-    def objective(key, params, batch, samples):
+    def objective(key, params, batch, samples, *, capacity):
         del key
-        out = render(params, batch, samples)
+        out = _render_batch(field, mesh, params, batch, samples, capacity=capacity)
         rgb, weight = batch.mean(out.rgb), batch.pixel_weight * batch.whole(out.ray_mask)
         weights = out.weights if through_weights else jax.lax.stop_gradient(out.weights)
         variance = rendered_variance(weights, out.values["beta"])
@@ -121,7 +132,6 @@ def make_variance_objective(
 def make_flow_objective(
     flow: FlowField,
     *,
-    capacity: int,
     num_draws: int = 32,
     entropy_weight: float = 0.01,
     floor: float = 1e-5,
@@ -130,25 +140,24 @@ def make_flow_objective(
     """Likelihood of the colours under K draws of a distribution over fields (CF-NeRF).
 
     Args:
-      capacity, mesh: see `make_colour_objective`.
       num_draws: K, of the base, shared by all points; new ones in each step.
       entropy_weight, floor: see `flow_loss`.
+      mesh: see `make_colour_objective`.
     """
 
-    def render(params, noise, batch, samples):
-        return render_rays(
-            batch.rays,
-            samples,
-            partial(flow.apply, params, noise=noise),
-            background=batch.background,
-            capacity=capacity,
-            exact=False,
-        )
+    def objective(key, params, batch, samples, *, capacity):
+        def render(params, noise, batch, samples):
+            return render_rays(
+                batch.rays,
+                samples,
+                partial(flow.apply, params, noise=noise),
+                background=batch.background,
+                capacity=capacity,
+                exact=False,
+            )
 
-    render_draw = over_rays(render, mesh, sharded=(False, False, True, True))
-    render_draws = jax.vmap(render_draw, in_axes=(None, 0, None, None))
-
-    def objective(key, params, batch, samples):
+        render_draw = over_rays(render, mesh, sharded=(False, False, True, True))
+        render_draws = jax.vmap(render_draw, in_axes=(None, 0, None, None))
         draws = render_draws(params, base_draws(key, num_draws), batch, samples)
         ray_mask, rgb = draws.ray_mask[0], jax.vmap(batch.mean)(draws.rgb)
         loss = flow_loss(

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 
 from bavs_jax.arrays import Array
 from bavs_jax.cameras import Rays
-from bavs_jax.devices import over_rays, shard_rays
+from bavs_jax.devices import num_shards, over_rays, shard_rays
 from bavs_jax.fields.base import Field
 from bavs_jax.models.base import ModelState, RayTerms, StepReport
 from bavs_jax.models.losses import colour_loss
@@ -31,15 +31,16 @@ class RayTraining(NamedTuple):
 
     objective: Objective  # from `objectives.py`
     num_rays: int  # R, rays of one step
+    capacity: int  # K, samples that each device evaluates in a step; see `places_needed`
     rays_per_pixel: int = 1  # see `sample_pixels`
     random_background: bool = False  # see `sample_pixels`
     penalty_weight: float = 0.0  # of the field's own penalty
     # Of the field's roughness, for one training pixel: as a prior should, it counts the less the
     # more pixels there are.
     roughness_weight: float = 0.0
-    # Samples on each device whose density is looked at in a step, to leave out those that are
-    # hidden behind others (`visible_samples`); 0 leaves out none.
-    capacity_before_hiding: int = 0
+    # Times K samples whose density is looked at in a step, to leave out those that are hidden
+    # behind others (`visible_samples`); 0 leaves out none.
+    look_ahead: int = 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,25 +84,15 @@ class RayField:
     ) -> tuple[jax.Array, StepReport]:
         """Of random pixels, R rays in all: the objective, and what field and sampler add."""
         training, params = self._how_trained(), state.params
-        pixel_key, sample_key, objective_key = jax.random.split(key, 3)
-        batch = sample_pixels(
-            pixel_key,
-            table,
-            is_training_view,
-            training.num_rays,
-            rays_per_pixel=training.rays_per_pixel,
-            background=self.background,
-            random_background=training.random_background,
-        )
-        batch = shard_rays(batch, self.mesh)
-        samples, aux = self.sampler.sample(sample_key, params["sampler"], state.carried, batch.rays)
+        *keys, objective_key = jax.random.split(key, 3)
+        batch, samples, aux = self._batch(keys, state, table, is_training_view)
         fits = jnp.ones(training.num_rays, bool)
-        if training.capacity_before_hiding and not self.sampler.dense:
-            samples, fits = self._visible(
-                params["field"], batch.rays, samples, capacity=training.capacity_before_hiding
-            )
+        if self._leaves_out:
+            samples, fits = self._visible(params["field"], batch.rays, samples)
             batch = batch.replace(pixel_weight=batch.pixel_weight * batch.whole(fits))
-        outcome = training.objective(objective_key, params["field"], batch, samples)
+        outcome = training.objective(
+            objective_key, params["field"], batch, samples, capacity=training.capacity
+        )
         pixel_weight = batch.pixel_weight * batch.whole(outcome.ray_mask)
 
         def colour_loss_fn(ray_rgb):
@@ -121,18 +112,65 @@ class RayField:
             thinned=samples.thinned.mean(),
         )
 
+    def places_needed(
+        self, key, state: ModelState, table: PixelTable, is_training_view
+    ) -> jax.Array:
+        """The least `RayTraining.capacity` with which `loss` leaves out no ray of its batch, [].
+
+        Another batch needs a few per cent more or less.
+        """
+        training = self._how_trained()
+        *keys, _ = jax.random.split(key, 3)
+        batch, samples, _ = self._batch(keys, state, table, is_training_view)
+        places = self._on_one_device(samples)
+        if self._leaves_out:
+            looked_at = -(-places // training.look_ahead)
+            seen, _ = self._visible(state.params["field"], batch.rays, samples)
+            places = jnp.maximum(looked_at, self._on_one_device(seen))
+        return places
+
+    def _on_one_device(self, samples: Samples) -> jax.Array:
+        """The most samples [] that a device has of its own."""
+        by_device = samples.sample_mask.reshape(num_shards(self.mesh), -1)
+        return by_device.sum(-1, dtype=jnp.int32).max()
+
+    def _batch(self, keys, state: ModelState, table: PixelTable, is_training_view):
+        """Random pixels with their rays, the samples of these, and what the sampler's loss needs;
+        `keys` [2]."""
+        training = self._how_trained()
+        pixel_key, sample_key = keys
+        batch = sample_pixels(
+            pixel_key,
+            table,
+            is_training_view,
+            training.num_rays,
+            rays_per_pixel=training.rays_per_pixel,
+            background=self.background,
+            random_background=training.random_background,
+        )
+        batch = shard_rays(batch, self.mesh)
+        params = state.params["sampler"]
+        return batch, *self.sampler.sample(sample_key, params, state.carried, batch.rays)
+
+    @property
+    def _leaves_out(self) -> bool:
+        """Whether a step looks ahead for samples that are hidden."""
+        return self._how_trained().look_ahead > 0 and not self.sampler.dense
+
     def _how_trained(self) -> RayTraining:
         if self.training is None:
             raise ValueError("training: None, so this model is only looked at; give it one")
         return self.training
 
-    def _visible(self, field_params, rays: Rays, samples: Samples, *, capacity: int):
+    def _visible(self, field_params, rays: Rays, samples: Samples):
+        training = self._how_trained()
+
         def visible(params, rays, samples):
             return visible_samples(
                 partial(self.field.density, params),
                 rays,
                 samples,
-                capacity=capacity,
+                capacity=training.look_ahead * training.capacity,
                 least=LEAST_LIGHT,
             )
 
