@@ -36,7 +36,7 @@ from experiments.runtime import track as show_progress
 KINDS = (RECONSTRUCTION, VARIANCE, FLOW)
 RENDER_CHUNK = 4096  # rays of one compiled rendering call
 RENDER_CAPACITY = 2 * RENDER_CHUNK  # samples of one of its passes: rays of a trained field need 3
-SHARES = (0.25, 0.5, 0.75, 1.0)  # of the sample buffer, for steps with fewer samples
+SHARES = (0.5, 1.0)  # of the sample buffer, for steps with fewer samples; each compiles once more
 SPARE = 1.1  # times the places that one batch needs are enough for the next ones
 YOUNG = 256  # steps, in which a field changes too fast to say what the next ones need
 # What can sample each kind of field; the first that suits the scene is the default.

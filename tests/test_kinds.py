@@ -140,11 +140,11 @@ def test_every_kind_of_training_fits_every_network(field_kind, kind):
 
 @pytest.mark.parametrize(
     "needed, size",
-    [(0, 200), (1, 200), (181, 200), (182, 400), (363, 400), (545, 600), (546, 800), (999, 800)],
+    [(0, 400), (1, 400), (363, 400), (364, 800), (800, 800), (999, 800)],
 )
 def test_a_buffer_is_the_smallest_share_with_room_to_spare(needed, size):
     assert fitting_capacity(needed, 800, most_points=24) == size
-    assert fitting_capacity(needed, 800, most_points=500) == max(size, 600)
+    assert fitting_capacity(needed, 800, most_points=500) == 800
 
 
 def test_a_field_with_few_samples_trains_the_same_in_a_smaller_buffer():
@@ -160,7 +160,7 @@ def test_a_field_with_few_samples_trains_the_same_in_a_smaller_buffer():
     state = whole.trainer.init(KEY)
     needed = int(jax.jit(whole.model.places_needed)(KEY, state.model, table, mask))
     just_enough = int(np.ceil(SPARE * needed))
-    for capacity in (just_enough, 4 * just_enough):
+    for capacity in (just_enough, 2 * just_enough):
         trainer = problem_with(capacity).trainer
         with count_traces() as young:
             trainer.call(KEY, jax.tree.map(jnp.copy, state), table, mask)
