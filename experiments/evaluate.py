@@ -7,7 +7,13 @@ import numpy as np
 from PIL import Image
 
 from bavs_jax.cameras import num_pixels
-from bavs_jax.metrics.image import depth_mae, measure_images
+from bavs_jax.metrics.image import (
+    depth_mae,
+    match_exposure,
+    measure_images,
+    psnr,
+    quantise_uint8,
+)
 from bavs_jax.rendering.images import render_views
 from experiments.build_model import RENDER_CHUNK
 from experiments.files import stack_pictures
@@ -66,7 +72,14 @@ def measure_baselines(scene, training_views, test_views) -> dict[str, float]:
 
 
 def evaluate_views(
-    render_fn, scene, view_ids, *, rays_per_pixel: int = 1, lpips_fn=None, progress_fn=None
+    render_fn,
+    scene,
+    view_ids,
+    *,
+    rays_per_pixel: int = 1,
+    lpips_fn=None,
+    exposure: bool = False,
+    progress_fn=None,
 ) -> dict:
     """Mean image measures over views by the 8-bit protocol, and the mean depth error.
 
@@ -76,12 +89,13 @@ def evaluate_views(
       view_ids: [n] which views.
       rays_per_pixel: see `render_views`; as many as the field was trained with.
       lpips_fn: see `measure_images`.
+      exposure: whether to measure `psnr_exposure`, too.
       progress_fn: called with the number of rays done.
 
     Returns:
-      dict of `psnr` (dB), `ssim`, `lpips`, `depth_mae` (scene units), `num_test_views` and
-      `thinned` (share of rays sampled more coarsely than asked for); null where not measured, as
-      all but the number are of no views.
+      dict of `psnr` (dB), `ssim`, `lpips`, `depth_mae` (scene units), `num_test_views`, `thinned`
+      (share of rays sampled more coarsely than asked for) and `psnr_exposure` (dB, after
+      `match_exposure`); null where not measured, as all but the number are of no views.
     """
 
     if not len(view_ids):
@@ -99,7 +113,7 @@ def evaluate_views(
         rays_per_pixel=rays_per_pixel,
         progress_fn=progress_fn,
     )
-    means = mean_quality(scene, view_ids, images, lpips_fn=lpips_fn)
+    means = mean_quality(scene, view_ids, images, lpips_fn=lpips_fn, exposure=exposure)
     thinned = float(np.mean([image["thinned"].mean() for image in images]))
     return {**means, "thinned": thinned, "num_test_views": len(images)}
 
@@ -132,18 +146,21 @@ def measure_test_views(problem, train, num: int, label: str) -> dict:
             view_ids,
             rays_per_pixel=rays_per_pixel,
             lpips_fn=problem.lpips_fn,
+            exposure=problem.model.reads_views,
             progress_fn=bar.advance,
         )
 
 
-def mean_quality(scene, view_ids, images: list[dict], *, lpips_fn=None) -> dict:
+def mean_quality(
+    scene, view_ids, images: list[dict], *, lpips_fn=None, exposure: bool = False
+) -> dict:
     """Means over views of what `evaluate_views` measures, of images that are rendered already.
 
     A view without known depth has no depth error, one without valid pixels no measure at all.
     """
-    rows = [_measure(scene, v, image, lpips_fn) for v, image in zip(view_ids, images)]
+    rows = [_measure(scene, v, image, lpips_fn, exposure) for v, image in zip(view_ids, images)]
     means = {}
-    for name in ("psnr", "ssim", "lpips", "depth_mae"):
+    for name in ("psnr", "ssim", "lpips", "depth_mae", "psnr_exposure"):
         known = [row[name] for row in rows if row.get(name) is not None]
         means[name] = float(np.mean(known)) if known else None
     return means
@@ -152,12 +169,15 @@ def mean_quality(scene, view_ids, images: list[dict], *, lpips_fn=None) -> dict:
 _measure_images = jax.jit(measure_images, static_argnames="lpips_fn")
 
 
-def _measure(scene, view_id: int, image: dict, lpips_fn) -> dict[str, float]:
+def _measure(scene, view_id: int, image: dict, lpips_fn, exposure: bool) -> dict[str, float]:
     mask = scene.mask_image(view_id)
     if mask is not None and not mask.any():
         return {}
     truth = scene.image(view_id).astype(np.float32) / 255.0
     row = _measure_images(image["rgb"], truth, mask=mask, lpips_fn=lpips_fn)
+    if exposure:
+        matched = match_exposure(np.asarray(image["rgb"]), truth, mask)
+        row["psnr_exposure"] = psnr(quantise_uint8(matched), truth, mask)
     true_depth = scene.depth_image(view_id)
     if true_depth is not None and mask is not None:
         true_depth = np.where(mask, true_depth, 0.0)

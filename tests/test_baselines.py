@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.evaluate import image_psnr, measure_baselines
+from experiments.evaluate import image_psnr, mean_quality, measure_baselines
 from tests.toy_scenes import toy_scene
 
 
@@ -49,3 +49,12 @@ def test_masked_pixels_do_not_count():
     scene = dataclasses.replace(scene, pixels=pixels, pixel_mask=mask)
     got = measure_baselines(scene, [1], [2])
     np.testing.assert_allclose(got["nearest_image_psnr"], 20 * np.log10(25.5))
+
+
+def test_a_view_of_another_exposure_is_measured_at_its_own_too():
+    scene = toy_scene(num_views=3, num_test=2, size=16)
+    truth = [scene.image(v) / 255.0 for v in (0, 1)]
+    images = [{"rgb": 0.6 * picture + 0.1, "depth": picture[..., 0]} for picture in truth]
+    got = mean_quality(scene, (0, 1), images, exposure=True)
+    assert got["psnr_exposure"] > 45 > 30 > got["psnr"]
+    assert mean_quality(scene, (0, 1), images)["psnr_exposure"] is None

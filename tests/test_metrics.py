@@ -142,6 +142,34 @@ def test_measure_images_quantises_both_and_runs_under_jit():
     assert measures["lpips"] is None
 
 
+def test_a_change_of_exposure_is_undone_but_no_pixel_fits_itself():
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0.2, 0.8, (6, 9, 3))
+    gain, offset = np.array([0.5, 1.3, 1.0]), np.array([0.1, -0.1, 0.02])
+    prediction = (truth - offset) / gain
+    np.testing.assert_allclose(image.match_exposure(prediction, truth), truth, atol=1e-12)
+
+    other = truth.copy()
+    other[:, :4] = rng.uniform(size=(6, 4, 3))  # a left half that nobody predicted
+    matched = image.match_exposure(prediction, other)
+    np.testing.assert_allclose(matched[:, :4], truth[:, :4], atol=1e-12)  # fitted on the right
+    for c in range(3):  # and the right half by the left one's straight line
+        slope, shift = np.polyfit(prediction[:, :4, c].ravel(), other[:, :4, c].ravel(), 1)
+        np.testing.assert_allclose(matched[:, 4:, c], slope * prediction[:, 4:, c] + shift)
+
+
+def test_exposure_of_masked_and_of_flat_halves():
+    rng = np.random.default_rng(1)
+    truth, mask = rng.uniform(size=(4, 8, 3)), np.ones((4, 8), bool)
+    prediction = truth - 0.1
+    mask[:, :4] = False
+    matched = image.match_exposure(prediction, np.where(mask[..., None], truth, 9.0), mask)
+    np.testing.assert_allclose(matched[:, :4], truth[:, :4], atol=1e-12)
+    np.testing.assert_array_equal(matched[:, 4:], prediction[:, 4:])  # nothing to fit on
+    flat = np.full((4, 8, 3), 0.3)
+    np.testing.assert_allclose(image.match_exposure(flat, flat + 0.2), flat + 0.2, atol=1e-12)
+
+
 def test_images_of_different_shape_are_refused():
     with pytest.raises(ValueError, match=r"must both be \[\.\.\., H, W, 3\]"):
         image.psnr(np.zeros((4, 4, 3)), np.zeros((1, 4, 4, 3)))

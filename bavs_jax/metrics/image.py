@@ -108,6 +108,41 @@ def measure_images(
     }
 
 
+def match_exposure(
+    prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None
+) -> np.ndarray:
+    """A prediction with the gain and offset of each channel that suit the truth's exposure.
+
+    A view that was not trained on has no code for its own exposure. Those of the left half of the
+    image are fitted by least squares on the right half, and the other way round, so that no pixel
+    has a part in its own fit. (Martin-Brualla et al. 2021 fit a code on the left half and measure
+    the right one.)
+
+    Args:
+      prediction, truth: [H, W, 3] sRGB in [0, 1].
+      mask: [H, W] bool, the pixels that are fitted; None for all.
+
+    Returns:
+      [H, W, 3]; a half whose counterpart has no pixel to fit stays as it is, and a counterpart of
+      one colour alone gives the offset only.
+    """
+    check_images(prediction, truth)
+    matched = np.array(prediction, np.float64)
+    middle = truth.shape[1] // 2
+    halves = (slice(None, middle), slice(middle, None))
+    for half, other in (halves, halves[::-1]):
+        fitted = np.ones(truth[:, other].shape[:2], bool) if mask is None else mask[:, other]
+        if not fitted.any():
+            continue
+        x = np.asarray(prediction, np.float64)[:, other][fitted]
+        y = np.asarray(truth, np.float64)[:, other][fitted]
+        mean_x, mean_y, variance = x.mean(0), y.mean(0), x.var(0)
+        covariance = ((x - mean_x) * (y - mean_y)).mean(0)
+        gain = np.where(variance > 1e-8, covariance / np.maximum(variance, 1e-8), 1.0)
+        matched[:, half] = gain * (matched[:, half] - mean_x) + mean_y
+    return matched
+
+
 def _window_mean(image: jax.Array) -> jax.Array:
     """Gaussian-weighted mean over each whole window, [..., H - 10, W - 10, 3]."""
     offsets = np.arange(SSIM_TAPS) - SSIM_TAPS // 2

@@ -107,7 +107,7 @@ def baseline_table(runs: list[Run]) -> Table | None:
     known = [run for run in stats.completed(runs) if run.result.get("baselines")]
     if not known or any(len(run.rounds) > 1 for run in runs):
         return None
-    rows = []
+    rows, has_exposure = [], all(run.rounds[-1].get("psnr_exposure") for run in known)
     for policy in policies_of(known):
         mine = [run for run in known if run.policy == policy]
         field = [run.rounds[-1]["psnr"] for run in mine]
@@ -116,8 +116,13 @@ def baseline_table(runs: list[Run]) -> Table | None:
         above = [psnr - max(pair) for psnr, *pair in zip(field, colour, photo)]
         means = [stats.mean_interval(values) for values in (field, colour, photo, above)]
         cells = [interval_cell(mean, 2, "", gap=mean is means[-1]) for mean in means]
+        if has_exposure:
+            fitted = stats.mean_interval([run.rounds[-1]["psnr_exposure"] for run in mine])
+            cells.insert(1, interval_cell(fitted, 2, ""))
         rows.append([policy, mine[0].rounds[-1]["num_test_views"], *cells])
-    head = ("policy", "held-out views", "field (dB)", "mean colour (dB)", "nearest photo (dB)")
+    head = ["policy", "held-out views", "field (dB)", "mean colour (dB)", "nearest photo (dB)"]
+    if has_exposure:
+        head.insert(3, "at their exposure (dB)")
     return Table((*head, "above the better of the two (dB)"), rows)
 
 
