@@ -27,7 +27,7 @@ from bavs_jax.pixel_table import PixelTable, view_mask
 from bavs_jax.policy_inputs import MakeInputs
 from bavs_jax.selection.batch import SelectionInfo, acquire
 from bavs_jax.selection.context import make_context
-from bavs_jax.selection.distances import Radii
+from bavs_jax.selection.distances import SURVIVOR_SHARE, Radii
 from bavs_jax.selection.policy import Mode, Policy
 from bavs_jax.training.fit import Fitted
 from bavs_jax.training.train import TrainState
@@ -64,7 +64,8 @@ class Acquisition:
     centre: Array  # [3] scene centre, scene units
     batch_size: int  # views chosen at once
     num_rays: int  # R of Eq 13, the training rays of round 0
-    radii: Radii | None = None  # of the max-min distance filter; None: from the cameras
+    radii: Radii | None = None  # of the max-min distance filter; None: by `survivor_share`
+    survivor_share: float = SURVIVOR_SHARE  # of the candidates, which the filter leaves
     mode: Mode | None = None  # None: the policy's own
     label: str = ""  # of the run, for progress
 
@@ -116,6 +117,7 @@ def select(key, state: ActiveState, acquisition: Acquisition) -> Choice:
         context,
         acquisition.batch_size,
         radii=acquisition.radii,
+        survivor_share=acquisition.survivor_share,
         mode=acquisition.mode,
     )
     elapsed = time.perf_counter() - start

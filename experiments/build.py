@@ -308,6 +308,7 @@ class Problem:
             batch_size=self.config.batch_size,
             num_rays=int(num_training_pixels(self.scene, np.asarray(initial)).sum()),
             radii=None if None in radii else Radii(*radii),
+            survivor_share=options.survivors,
             mode=options.mode,
             label=label,
         )

@@ -179,9 +179,10 @@ _OPTIONS_OF_A_KIND = {
     # numbers
     "checkpoint_seconds train.roughness_weight": number(0.0, MAX_VALUE),
     "candidates.min_train_distance candidates.min_candidate_distance": default(
-        positive(MAX_VALUE), "0.2 x the median camera distance"
+        positive(MAX_VALUE), "those that leave candidates.survivors"
     ),
-    "candidates.image_scale train.final_share train.adam_eps": positive(1.0),
+    "candidates.image_scale candidates.survivors": positive(1.0),
+    "train.final_share train.adam_eps": positive(1.0),
     "hash_grid.initial_optical_depth": number(1e-6, 1e3),
     "flow_training.entropy_weight train.penalty_weight": number(0.0, 1e6),
     "proposal.interlevel_weight proposal.distortion_weight": number(0.0, 1e6),

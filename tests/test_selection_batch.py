@@ -119,7 +119,7 @@ def test_filter_goes_before_the_score():
     np.testing.assert_array_equal(together, [0, 1])
     asked.clear()
     # Nearest-training distances are 20, 20.0002, 14.1, 14.1: candidate 1 is visited first.
-    apart, info = acquire(POLICIES["bavs"], KEY, ctx, 2)
+    apart, info = acquire(POLICIES["bavs"], KEY, ctx, 2, radii=Radii(2.0, 2.0))
     np.testing.assert_array_equal(apart, [1, 2])
     assert asked == [1, 2, 3]
     np.testing.assert_array_equal(info.survivors, [False, True, True, True])
@@ -130,8 +130,25 @@ def test_filter_goes_before_the_score():
         [np.hypot(20.0, 0.1), np.hypot(10.0, 10.0)],
         rtol=1e-6,  # float32
     )
-    np.testing.assert_allclose(info.filter.radii, 2.0, rtol=1e-6)  # 0.2 of 10
+    np.testing.assert_allclose(info.filter.radii, 2.0, rtol=1e-6)
     assert info.filter.num_survivors == 3
+
+
+@pytest.mark.parametrize("share, fewest", [(0.17, 17), (0.5, 50), (0.02, 4)])
+def test_by_default_the_filter_leaves_a_share_of_the_candidates(share, fewest):
+    """Or as many as are picked: Table 4 of the paper leaves 43 of 250."""
+    places = np.random.default_rng(1).normal(size=(100, 3))
+    ctx = make_context(
+        places / np.linalg.norm(places, axis=1, keepdims=True),
+        training_positions=[[0.0, 0.0, 1.0]],
+        is_training_view=[True],
+        centre=np.zeros(3),
+    )
+    policy = policy_of(np.arange(100.0), distance_filter=True)
+    _, info = acquire(policy, KEY, ctx, 4, survivor_share=share)
+    assert fewest <= info.survivors.sum() <= 1.3 * fewest
+    if share == 0.17:
+        np.testing.assert_array_equal(acquire(policy, KEY, ctx, 4)[1].survivors, info.survivors)
 
 
 def test_overlap_with_farthest_view_is_reported():

@@ -8,11 +8,11 @@ import pytest
 
 from bavs_jax.selection.distances import (
     Radii,
-    default_radii,
     farthest_ranks,
     max_min_filter,
     nearest_distances,
     pairwise_distances,
+    radii_for_share,
 )
 from tests import oracles_selection as oracles
 
@@ -93,22 +93,43 @@ def test_nearest_distances_see_only_valid_views():
     np.testing.assert_array_equal(nearest_distances(points, others[:0], np.zeros(0, bool)), np.inf)
 
 
-def test_default_radii_are_a_fifth_of_the_median_distance_from_the_centre():
-    centre = np.array([1.0, 0.0, 0.0], np.float32)
-    candidates, training = line(2, 3, 100), line(5, 200, 300)  # distances 1, 2, | 4
-    radii = default_radii(
-        candidates, np.array([True, True, False]), training, np.array([1, 0, 0], bool), centre
+@pytest.mark.parametrize("share", [0.05, 0.17, 0.6])
+def test_radii_for_a_share_are_the_largest_of_their_steps_that_leave_it(share):
+    """The slow filter, from the same radius down by the same steps."""
+    rng = np.random.default_rng(3)
+    positions = rng.normal(size=(60, 3)).astype(np.float32)
+    mask, training = rng.random(60) < 0.8, rng.normal(size=(5, 3)).astype(np.float32)
+    is_training, centre = np.array([1, 1, 0, 1, 0], bool), np.array([0.2, 0.0, 0.1], np.float32)
+    radii = jax.jit(radii_for_share)(
+        positions, training, is_training, mask, share, view_ids=np.arange(60), centre=centre
     )
-    np.testing.assert_allclose(radii, 0.2 * 2.0, rtol=1e-6)  # float32
+    assert radii.min_train_distance == radii.min_candidate_distance
+    counted = np.concatenate([positions[mask], training[is_training]]).astype(np.float64)
+    start = 2.0 * np.median(np.linalg.norm(counted - centre, axis=-1))
+    for step in range(200):
+        survivors, shrinks, _ = oracles.max_min_filter(
+            positions,
+            training[is_training],
+            mask,
+            1,
+            view_ids=range(60),
+            radii=(start * 0.95**step,) * 2,
+        )
+        if shrinks == 0 and survivors.sum() >= share * mask.sum():
+            break
+    np.testing.assert_allclose(radii.min_train_distance, start * 0.95**step, rtol=1e-5)
 
 
-def test_default_radii_stay_while_views_of_one_pool_become_training_views():
+def test_radii_for_a_share_scale_with_the_scene_and_need_no_training_view():
     positions = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
-    centre = np.zeros(3, np.float32)
-    few, many = np.arange(20) < 3, np.arange(20) < 11
-    before = default_radii(positions, ~few, positions, few, centre)
-    after = default_radii(positions, ~many, positions, many, centre)
-    np.testing.assert_array_equal(before, after)
+    none, every, centre = np.zeros(20, bool), np.ones(20, bool), np.zeros(3, np.float32)
+    small, large = (
+        jax.jit(radii_for_share)(
+            s * positions, positions, none, every, 0.3, view_ids=np.arange(20), centre=centre
+        )
+        for s in (1.0, 8.0)
+    )
+    np.testing.assert_allclose(np.asarray(large), 8.0 * np.asarray(small), rtol=1e-5)
 
 
 # --- the filter ------------------------------------------------------------------------------

@@ -10,12 +10,13 @@ from bavs_jax.arrays import Array
 from bavs_jax.selection import SelectionError
 from bavs_jax.selection.context import Context, mark_picked
 from bavs_jax.selection.distances import (
+    SURVIVOR_SHARE,
     FilterInfo,
     Radii,
-    default_radii,
     farthest_ranks,
     max_min_filter,
     nearest_distances,
+    radii_for_share,
 )
 from bavs_jax.selection.information import BatchBound
 from bavs_jax.selection.policy import MODES, Mode, Policy, UpdateFn
@@ -90,8 +91,8 @@ def make_select_batch_fn(k: int) -> SelectBatchFn:
 
     Returns:
       `select_batch_fn(scores [C], ctx, radii=None)`, which gives what `select_batch` does; `radii`
-      default to `default_radii`. It raises SelectionError if a score in `ctx.mask` is NaN, or if k
-      is more than `ctx.mask` has.
+      default to those that leave `SURVIVOR_SHARE` of the candidates. It raises SelectionError if a
+      score in `ctx.mask` is NaN, or if k is more than `ctx.mask` has.
     """
     jitted = jax.jit(select_batch, static_argnums=3)
 
@@ -105,7 +106,7 @@ def make_select_batch_fn(k: int) -> SelectBatchFn:
             view_ids=ctx.view_ids,
             training_positions=ctx.training_positions,
             is_training_view=ctx.is_training_view,
-            radii=_as_radii(radii, ctx),
+            radii=_as_radii(radii, ctx, SURVIVOR_SHARE),
         )
 
     return select_batch_fn
@@ -117,7 +118,7 @@ def make_select_batch_fn(k: int) -> SelectBatchFn:
 _filter_fn = jax.jit(max_min_filter)
 _ranks_fn = jax.jit(farthest_ranks)
 _nearest_fn = jax.jit(nearest_distances)
-_radii_fn = jax.jit(default_radii)
+_radii_fn = jax.jit(radii_for_share)
 _top_k_fn = jax.jit(top_k, static_argnames="k")
 
 
@@ -128,6 +129,7 @@ def acquire(
     k: int,
     *,
     radii: Radii | None = None,
+    survivor_share: float = SURVIVOR_SHARE,
     mode: Mode | None = None,
     distance_filter: bool | None = None,
 ) -> tuple[np.ndarray, SelectionInfo]:
@@ -143,7 +145,9 @@ def acquire(
         what was picked before and not by noise.
       ctx: candidates and sources of scores.
       k: batch size, 1 .. the number of candidates in `ctx.mask`.
-      radii: where the filter begins, scene units; default `default_radii`.
+      radii: where the filter begins, scene units; None: by `survivor_share`.
+      survivor_share: of the candidates in `ctx.mask`, which the filter is to leave (see
+        `radii_for_share`).
       mode: "top_k" or "greedy"; default the policy's own.
       distance_filter: whether to filter; default the policy's own.
 
@@ -161,7 +165,7 @@ def acquire(
 
     survivors, filter_info = np.asarray(ctx.mask), None
     if distance_filter:
-        survivors, filter_info = _max_min_survivors(ctx, k, _as_radii(radii, ctx))
+        survivors, filter_info = _max_min_survivors(ctx, k, _as_radii(radii, ctx, survivor_share))
 
     choose = _choose_top_k if mode == "top_k" else _choose_greedily
     left = ctx.replace(mask=survivors)
@@ -215,11 +219,9 @@ def _farthest_ranks(ctx: Context, num_picks: int) -> np.ndarray:
     return np.asarray(_ranks_fn(*_cameras(ctx), num_picks, view_ids=ctx.view_ids))
 
 
-def _as_radii(radii: Radii | None, ctx: Context) -> Radii:
+def _as_radii(radii: Radii | None, ctx: Context, survivor_share: float) -> Radii:
     if radii is None:
-        radii = _radii_fn(
-            ctx.positions, ctx.mask, ctx.training_positions, ctx.is_training_view, ctx.centre
-        )
+        radii = _radii_fn(*_cameras(ctx), survivor_share, view_ids=ctx.view_ids, centre=ctx.centre)
     # One dtype whoever gave them, so that default and given radii share one compilation.
     return Radii(*(np.asarray(r, np.float32) for r in radii))
 

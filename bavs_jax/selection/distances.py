@@ -7,7 +7,8 @@ import jax.numpy as jnp
 
 from bavs_jax.arrays import Array
 
-DEFAULT_RADIUS = 0.2  # of the median camera distance from the scene centre
+SURVIVOR_SHARE = 0.17  # of the candidates, as in the paper's Table 4, which leaves 43 of 250
+SHARE_SHRINK, SHARE_MAX_SHRINKS = 0.95, 180  # radii of a share end at 1e-4 of where they began
 DEFAULT_SHRINK = 0.8
 DEFAULT_MAX_SHRINKS = 32  # radii end at 0.8^32 < 1e-3 of where they began
 
@@ -50,28 +51,42 @@ def masked_nearest(distances: jax.Array, is_valid: jax.Array) -> jax.Array:
     return jnp.min(jnp.where(is_valid, distances, jnp.inf), axis=-1, initial=jnp.inf)
 
 
-def default_radii(
+def radii_for_share(
     positions: jax.Array,
-    mask: jax.Array,
     training_positions: jax.Array,
     is_training_view: jax.Array,
+    mask: jax.Array,
+    share: float | jax.Array,
+    *,
+    view_ids: jax.Array,
     centre: jax.Array,
 ) -> Radii:
-    """Both radii: 0.2 of the median camera distance from the scene centre.
+    """The largest radii, both the same, with which the filter leaves a share of the candidates.
 
-    The median runs over candidates and training views together, so that it stays the same while
-    views of one pool move from the former to the latter.
+    Found from twice the median camera distance from the scene centre down, in steps of 0.95: a few more
+    may be left than asked for. The paper names no radii, but what they leave (Table 4).
 
     Args:
-      positions, training_positions: [C, 3] candidates and [V, 3], scene units.
-      mask, is_training_view: [C] and [V] bool, which of them count.
+      positions, training_positions, is_training_view, mask, view_ids: see `max_min_filter`.
+      share: of the candidates in `mask`, in [0, 1].
       centre: [3] scene units.
     """
     cameras = jnp.concatenate([positions, training_positions])
     counts = jnp.concatenate([mask, is_training_view])
     distance = pairwise_distances(cameras, centre[None])[:, 0]
-    radius = DEFAULT_RADIUS * jnp.nanmedian(jnp.where(counts, distance, jnp.nan))
-    return Radii(radius, radius)
+    start = 2.0 * jnp.nanmedian(jnp.where(counts, distance, jnp.nan))
+    _, info = max_min_filter(
+        positions,
+        training_positions,
+        is_training_view,
+        mask,
+        jnp.ceil(share * mask.sum()),
+        view_ids=view_ids,
+        radii=Radii(start, start),
+        shrink=SHARE_SHRINK,
+        max_shrinks=SHARE_MAX_SHRINKS,
+    )
+    return info.radii
 
 
 def max_min_filter(

@@ -1,6 +1,7 @@
 """Uncertainty as one more volume-rendered channel (Fig 4), whose mean is a view's score (Eq 15)."""
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -125,20 +126,21 @@ def make_render_chunk_fn(
     The devices of a `mesh` (see `devices.py`) share the rays.
 
     Returns:
-      `render_chunk(state, variance [G], rays)`, which gives of R rays the `basic_images` and
-      "uncertainty" [R]; without the last where the variance is None.
+      `render_chunk(state, variance [G], rays)`, which gives of R rays the `basic_images`,
+      "uncertainty" [R] on the scale asked for, and "sigma" [R], scene units; without the last two
+      where the variance is None.
     """
+    scales = {"uncertainty": scale, "sigma": "sigma"}
 
     def render_chunk(state, variance, rays):
         channels = {}
         if variance is not None:
-            channels["uncertainty"] = make_uncertainty_channel(
-                grid, variance, variant=variant, scale=scale, extent=extent
-            )
+            make = partial(make_uncertainty_channel, grid, variance, variant=variant, extent=extent)
+            channels = {name: make(scale=scales[name]) for name in scales}
         rendering = model.render(state, rays, channels=channels)
         images = basic_images(rendering)
         for name, value in rendering.channels.items():
-            images[name] = finish_uncertainty(value, scale=scale)
+            images[name] = finish_uncertainty(value, scale=scales[name])
         return images
 
     return jit_over_rays(render_chunk, mesh, sharded=(False, False, True))

@@ -137,7 +137,8 @@ def get_config() -> ConfigDict:
         "gauss_newton"  # "gauss_newton", "residual_weighted" or "empirical_fisher"
     )
     config.uncertainty.variant = "posterior"  # "posterior" or "bayesrays"
-    config.uncertainty.scale = "log"  # "log": log10(sigma / third of the box) on [0, 1]; "sigma"
+    # Of pictures and AUSE, "log": log10(sigma / third of the box) on [0, 1]; "sigma".
+    config.uncertainty.scale = "log"
     config.uncertainty.extent = "box"  # what counts: the scene "box", or all "space" around it too
     config.uncertainty.offset_cells = 0.3  # of "laplace_predictive": offsets a priori, in cells
     config.uncertainty.flow_draws = 16  # of "cf_nerf" when rendering; 32 in its paper
@@ -164,7 +165,8 @@ def get_config() -> ConfigDict:
     config.candidates.hemisphere_draws = 100
     config.candidates.image_scale = 0.25  # of width and height, for the score (Eq 15)
     config.candidates.mode = placeholder(str)  # "top_k", "greedy"; None: the policy's own
-    # Of the max-min distance filter, scene units; None: 0.2 x median camera distance.
+    config.candidates.survivors = 0.17  # share that the max-min distance filter leaves (Fig 5)
+    # Its radii in place of that, scene units.
     config.candidates.min_train_distance = placeholder(float)
     config.candidates.min_candidate_distance = placeholder(float)
 

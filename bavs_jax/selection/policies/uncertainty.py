@@ -11,27 +11,39 @@ def mean_score(key, ctx):
     return score_candidates(ctx, lambda indices: mean_uncertainty(indices, ctx.picked))
 
 
-BAVS_TOPK = Policy(
-    name="bavs_topk",
-    summary="The k candidates of largest mean rendered uncertainty (Eq 15), no distance filter.",
+BY_IMAGE = Policy(
+    name="",
+    summary="",
     score_fn=mean_score,
     needs=frozenset({"mean_uncertainty_fn"}),
 )
-ACTIVENERF_STAR = BAVS_TOPK._replace(
+ACTIVENERF_STAR = BY_IMAGE._replace(
     name="activenerf_star",
     summary="ActiveNeRF's choice, from a field trained beside; the reconstruction is ours.",
     uncertainty="learned_variance",
     measure="gain",
 )
+# BavsNeRF. The paper leaves the scale of sigma open: its mean counts what is least known, that of
+# its logarithm, as pictures show it, counts what is known a little less than the rest.
+BAVS = BY_IMAGE._replace(
+    name="bavs",
+    summary="The paper's batch policy: max-min distance filter (Fig 5), then mean sigma (Eq 15).",
+    measure="sigma",
+    distance_filter=True,
+)
 
 POLICIES = (
-    # BavsNeRF: among what the max-min distance filter leaves.
-    BAVS_TOPK._replace(
-        name="bavs",
-        summary="The paper's batch policy: max-min distance filter (Fig 5), then mean uncertainty.",
-        distance_filter=True,
+    BAVS,
+    BAVS._replace(
+        name="bavs_log",
+        summary="As bavs, by the mean of log sigma, as pictures show it.",
+        measure="uncertainty",
     ),
-    BAVS_TOPK,
+    BAVS._replace(
+        name="bavs_topk",
+        summary="The k candidates of largest mean sigma (Eq 15), no distance filter.",
+        distance_filter=False,
+    ),
     # ActiveNeRF (Pan et al. 2022): its choice and its field, which learns a variance of colour.
     ACTIVENERF_STAR._replace(
         name="activenerf",
@@ -40,13 +52,13 @@ POLICIES = (
     ),
     ACTIVENERF_STAR,
     # Shen et al. 2022 use their uncertainty for maps alone; the choice of views by it is ours.
-    BAVS_TOPK._replace(
+    BY_IMAGE._replace(
         name="cf_nerf",
         summary="The k candidates of largest variance over draws of conditional flows.",
         uncertainty="cf_nerf",
     ),
     # CONVERGE.
-    BAVS_TOPK._replace(
+    BY_IMAGE._replace(
         name="coverage",
         summary="Greedily the view that sees most surface from directions that are new.",
         uncertainty="coverage",
@@ -54,19 +66,19 @@ POLICIES = (
         mode="greedy",
     ),
     # Density-aware ensembles (Sünderhauf et al. 2022).
-    BAVS_TOPK._replace(
+    BY_IMAGE._replace(
         name="ensemble",
         summary="The k candidates on which several trained fields disagree most.",
         uncertainty="ensemble",
     ),
     # Lee et al. 2022: how sure rays are of where they end.
-    BAVS_TOPK._replace(
+    BY_IMAGE._replace(
         name="entropy",
         summary="The k candidates of largest mean ray entropy.",
         uncertainty="entropy",
     ),
     # WarpRF (Safadoust et al. 2025).
-    BAVS_TOPK._replace(
+    BY_IMAGE._replace(
         name="warp",
         summary="The k candidates whose renders agree least with training views warped into them.",
         uncertainty="warp",
