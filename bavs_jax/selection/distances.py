@@ -63,8 +63,8 @@ def radii_for_share(
 ) -> Radii:
     """The largest radii, both the same, with which the filter leaves a share of the candidates.
 
-    Found from twice the median camera distance from the scene centre down, in steps of 0.95: a few more
-    may be left than asked for. The paper names no radii, but what they leave (Table 4).
+    Found from twice the median camera distance from the scene centre down, in steps of 0.95: a few
+    more may be left than asked for. The paper names no radii, but what they leave (Table 4).
 
     Args:
       positions, training_positions, is_training_view, mask, view_ids: see `max_min_filter`.

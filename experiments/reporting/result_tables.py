@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.bench import results as bench
 from experiments.bench.same_numbers import DEVICE_FILE, differences_table
-from experiments.reporting import run_tables, stats, uncertainty
+from experiments.reporting import run_tables, stats, uncertainty, view_sets
 from experiments.reporting.results import Run, load_runs, policies_of, read_result
 from experiments.reporting.tables import Collected, Table, interval_cell
 from experiments.runtime import ReportError
@@ -219,4 +219,5 @@ FILES: dict[str, Callable[[pathlib.Path], Collected]] = {
     "cleanup.json": partial(_trained, cleanup_table),
     "draws.json": partial(_trained, draws_table),
     "geometry.json": partial(_trained, geometry_table),
+    view_sets.FILE: view_sets.view_set_tables,
 }
