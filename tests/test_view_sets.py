@@ -21,14 +21,20 @@ BALL = 0.7  # radius of the toy scene's
 
 def ball_with_depth(num_views=44):
     """The toy scene with its true depth, by where rays meet the ball."""
-    scene = toy_scene(num_views, num_test=32, size=40)
+    scene = toy_scene(num_views, size=40)
     view_ids, pixels = view_pixels(scene.cameras, np.arange(num_views))
     rays = pixel_rays(scene.cameras, view_ids, pixels)
     origins, directions = (np.asarray(x, np.float64) for x in (rays.origins, rays.directions))
     along = -(origins * directions).sum(-1)
     half = BALL**2 - ((origins + along[:, None] * directions) ** 2).sum(-1)
     depth = np.where(half > 0.0, along - np.sqrt(np.maximum(half, 0.0)), 0.0)
-    return dataclasses.replace(scene, depth=depth.astype(np.float32))
+    is_pool = np.arange(num_views) % 4 == 0  # test views between them show all sides
+    return dataclasses.replace(
+        scene,
+        depth=depth.astype(np.float32),
+        pool=np.flatnonzero(is_pool).astype(np.int32),
+        test=np.flatnonzero(~is_pool).astype(np.int32),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +54,7 @@ def test_a_view_sees_what_faces_it_on_a_ball(ball):
         # The whole ball is in every image, and it is convex; what is seen at a slant is left out.
         clear = np.abs(facing) > 0.35
         assert clear.sum() > 100
-        assert (surface.seen[view] == (facing > 0.0))[clear].mean() > 0.98
+        assert (surface.seen[view] == (facing > 0.0))[clear].mean() > 0.998
     assert not surface.seen[scene.test].any()
 
 
