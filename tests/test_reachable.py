@@ -75,7 +75,7 @@ def test_each_view_is_reached_from_the_one_before(undisturbed, scene):
     assert "Pool: reachable, seed 0: on offer are the 5 unused views nearest to the last " in page
 
 
-@pytest.mark.parametrize("method", ["_choose", "_save"])
+@pytest.mark.parametrize("method", ["_choose", pytest.param("_save", marks=pytest.mark.slow)])
 def test_killed_anywhere_a_run_moves_on_from_where_it_was(
     run_all, undisturbed, scene, tmp_path, monkeypatch, method
 ):
