@@ -116,6 +116,30 @@ def captured_candidates(
     return CandidateSource(propose, acquire)
 
 
+def reachable_candidates(source: CandidateSource, current: int, num: int) -> CandidateSource:
+    """The candidates of a source that a camera reaches in one move.
+
+    Of those that the source has on offer, the nearest to the current view stay on offer; of equally
+    near ones, the first.
+
+    Args:
+      source: of all candidates.
+      current: row of the pixel table with the view taken last.
+      num: most that are reached.
+    """
+
+    def propose(key, table, is_training_view):
+        candidates = source.propose(key, table, is_training_view)
+        here = np.asarray(table.cameras.positions[current])
+        distance = np.linalg.norm(np.asarray(candidates.cameras.positions) - here, axis=-1)
+        distance = np.where(candidates.mask, distance, np.inf)
+        is_near = np.zeros_like(candidates.mask)
+        is_near[np.argsort(distance, kind="stable")[:num]] = True
+        return candidates._replace(mask=candidates.mask & is_near)
+
+    return CandidateSource(propose, source.acquire)
+
+
 def scene_hemisphere(key, scene: Scene, num: int) -> np.ndarray:
     """Poses on the hemisphere around a scene, as far away as its cameras are in the median."""
     positions = np.asarray(scene.cameras.positions)[np.asarray(scene.pool)]

@@ -12,15 +12,21 @@ import numpy as np
 from jax.sharding import Mesh
 
 from bavs_jax.active import Acquisition, ActiveState
-from bavs_jax.candidates import captured_candidates, dataset_candidates, with_empty_views
+from bavs_jax.candidates import (
+    captured_candidates,
+    dataset_candidates,
+    reachable_candidates,
+    with_empty_views,
+)
 from bavs_jax.devices import num_shards, put_on_all
 from bavs_jax.fields.deformation import DeformationGrid, offset_unit
 from bavs_jax.metrics.perceptual import make_lpips_fn
 from bavs_jax.models.base import RadianceModel
 from bavs_jax.pixel_table import make_pixel_table, num_training_pixels
 from bavs_jax.policy_inputs import InputMaker, LookOptions
-from bavs_jax.scenes import Scene, SceneError, load_scene, sculpture
+from bavs_jax.scenes import Scene, SceneError, load_scene, pools, sculpture
 from bavs_jax.scenes.procedural import capture
+from bavs_jax.scenes.zoom import Zoom
 from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.training.fit import Trainer, is_stuck, single_colour_error
@@ -75,9 +81,23 @@ def stream_key(seed: int, stream: str) -> jax.Array:
 
 
 def load_config_scene(config, *, cache_dir: str | None) -> Scene:
-    """The scene that a config names; SceneError if its files cannot be used."""
+    """The scene that a config names, with the pool that it asks for.
+
+    SceneError if its files cannot be used, or have no such pool.
+    """
+    pool = config.pool
+    scene = _load(config, cache_dir, Zoom(pool.factor, pool.seed) if pool.kind == "zoom" else None)
+    if pool.kind == "unbalanced":
+        return pools.unbalanced(scene, share=pool.share, seed=pool.seed)
+    if pool.kind == "arc":
+        return pools.arc(scene, degrees=pool.degrees, seed=pool.seed)
+    return scene
+
+
+def _load(config, cache_dir: str | None, zoom: Zoom | None) -> Scene:
     if config.loader == "procedural":
-        return load_scene("procedural", image_size=config.image_size, cache_dir=cache_dir)
+        options = {"image_size": config.image_size, "cache_dir": cache_dir, "zoom": zoom}
+        return load_scene("procedural", **options)
     folder, default = config.data_dir, os.environ.get("BAVS_DATA")
     if not folder and not default:
         raise SceneError(
@@ -85,7 +105,7 @@ def load_config_scene(config, *, cache_dir: str | None) -> Scene:
             "pass --config.data_dir=FOLDER_OF_SCENES"
         )
     root = os.path.join(folder or os.path.join(default, config.loader), config.scene)
-    options = {name: value for name, value in config.load.items() if value}
+    options = {name: value for name, value in [*config.load.items(), ("zoom", zoom)] if value}
     if options.get("pool_size", 0.0) >= 1:
         options["pool_size"] = int(options["pool_size"])
     return load_scene(config.loader, root=root, image_size=config.image_size or None, **options)
@@ -99,15 +119,18 @@ def true_surface(config) -> Callable | None:
 def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:
     """Which views a run starts with: a function of seed and scene alone, never of the policy.
 
-    A `num` of 0 takes all of the pool.
+    A `num` of 0 takes all of the pool, or of the arc that a run begins in.
     """
-    num = num or len(scene.pool)
-    if not 1 <= num <= len(scene.pool):
+    start, where, fix = scene.pool, "the pool has", ""
+    if scene.start is not None:
+        start, where, fix = scene.start, "the arc to begin in has", ", or a larger pool.degrees"
+    num = num or len(start)
+    if not 1 <= num <= len(start):
         raise SceneError(
-            f"{scene.name}: num_initial is {num}, but the pool has {len(scene.pool)} views: "
-            "give a number between 1 and that"
+            f"{scene.name}: num_initial is {num}, but {where} {len(start)} views: "
+            f"give a number between 1 and that{fix}"
         )
-    return np.random.default_rng(seed).permutation(np.asarray(scene.pool))[:num]
+    return np.random.default_rng(seed).permutation(np.asarray(start))[:num]
 
 
 def _takes_pictures(config) -> bool:
@@ -128,8 +151,8 @@ def check_views(config, scene: Scene) -> None:
     if not _takes_pictures(config):
         if taken > left:
             raise ConfigError(
-                f"{rounds} views, but {scene.name} has {left} in the pool beside the initial "
-                "ones; give fewer"
+                f"{rounds} views, but {scene.name} has {left} in its {config.pool.kind} pool "
+                "beside the initial ones; give fewer"
             )
     elif taken * int(np.diff(scene.offsets).max()) > MAX_NEW_PIXELS:
         raise ConfigError(
@@ -296,13 +319,21 @@ class Problem:
             self.setup, self.model_fns, look, track=self.track, true_error_fn=true_error_fn
         )
 
-    def acquisition(self, policy_name: str, initial, label: str) -> Acquisition:
-        """How a policy of the config chooses, in a run that began with the views `initial`."""
-        options = self.config.candidates
+    def acquisition(
+        self, policy_name: str, initial, label: str, current: int | None = None
+    ) -> Acquisition:
+        """How a policy of the config chooses, in a run that began with the views `initial`.
+
+        `current` is the row of the view taken last; None: the last of the initial ones.
+        """
+        options, pool, source = self.config.candidates, self.config.pool, self.source
+        if pool.kind == "reachable":
+            current = int(initial[-1]) if current is None else current
+            source = reachable_candidates(source, current, pool.num_nearest)
         radii = (options.min_train_distance, options.min_candidate_distance)
         return Acquisition(
             get_policy(policy_name),
-            self.source,
+            source,
             self.inputs,
             centre=self.scene.centre,
             batch_size=self.config.batch_size,

@@ -17,6 +17,7 @@ from ml_collections import ConfigDict
 
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.uncertainty.model import RECONSTRUCTION
+from experiments.configs import base
 from experiments.runtime import WorkdirError, is_first_process, reason, warn
 
 SUMMARY_VERSION = 1
@@ -316,6 +317,7 @@ def modern(saved: dict) -> dict:
             group[name] = modern_value(option, group[name])
     if type(saved.get("view_seed")) is str:  # a seed was written as text
         saved["view_seed"] = int(saved["view_seed"])
+    saved.setdefault("pool", base.get_config().pool.to_dict())  # all of them were even
     return saved
 
 

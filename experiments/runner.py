@@ -100,7 +100,8 @@ class Run:
         """Opens the next round with the views that the policy chooses."""
         number = int(state.round) + 1
         choose_key, restart_key, _ = active.round_keys(run_key(self.seed), number)
-        acquisition = self.problem.acquisition(self.policy, self.initial, self.label)
+        current = self.rounds[-1]["selected"][-1]  # in the checkpoint's notes
+        acquisition = self.problem.acquisition(self.policy, self.initial, self.label, current)
         choice = active.select(choose_key, state, acquisition)
         state, view_ids = active.update(state, choice, acquisition.source)
         save_choice(self.folder, number, choice, in_scene=not self.problem.has_empty_views)

@@ -14,6 +14,7 @@ from bavs_jax.metrics.ause import ERRORS, variant_name
 from bavs_jax.metrics.perceptual import NETS
 from bavs_jax.scenes import LOADERS
 from bavs_jax.scenes.lightfield import SPLITS
+from bavs_jax.scenes.pools import KINDS as POOLS
 from bavs_jax.selection.policies import POLICIES
 from bavs_jax.selection.policy import MODES
 from bavs_jax.uncertainty.channel import EXTENTS, SCALES, VARIANTS
@@ -102,6 +103,7 @@ TEXT = Option(
 SEED = whole(0, MAX_SEED)
 COUNT = whole(1, MAX_COUNT, "all")
 AS_LOADED = "as the loader sees fit"
+SHARE = Option("a number from 1/3 to below 1", lambda x: type(x) is float and 1 / 3 <= x < 1)
 BELOW_1 = Option("a number from 0 to below 1", lambda x: type(x) in (int, float) and 0 <= x < 1)
 AUSE_VARIANTS = [
     variant_name(of=of, error=error, pooled=pooled)
@@ -129,6 +131,7 @@ _OPTIONS_OF_A_KIND = {
     "evaluation.variant": choice(*AUSE_VARIANTS),
     "evaluation.interval_scale": choice(*INTERVAL_SCALES),
     "candidates.source": choice("dataset", "hemisphere"),
+    "pool.kind": choice(*POOLS),
     "candidates.mode": default(choice(*MODES), "the policy's own"),
     "view_seed": default(SEED, "each seed its own"),
     # tuples
@@ -143,7 +146,11 @@ _OPTIONS_OF_A_KIND = {
     ),
     "load.test_every": default(whole(2, 100_000), AS_LOADED),
     "load.downscale": default(whole(1, 1024), AS_LOADED),
-    "load.seed": SEED,
+    "load.seed pool.seed": SEED,
+    "pool.share": SHARE,
+    "pool.degrees": positive(360.0),
+    "pool.num_nearest": views(),
+    "pool.factor": number(1.0, 100.0, above=True),
     "image_size": whole(1, MAX_WIDTH, "as the files are"),
     "num_initial": views("all of the pool"),
     "batch_size candidates.hemisphere_draws": views(),
@@ -241,7 +248,24 @@ def check_config(config: ConfigDict, *more: str, name: str = "config") -> Config
             f"{name}.candidates: give both min_train_distance and min_candidate_distance, "
             "or neither"
         )
+    check_pool(values, name)
     return config
+
+
+def check_pool(values: dict, name: str) -> None:
+    """Raises ConfigError where the kind of pool does not go with the other options."""
+    kind, batch = values["pool.kind"], values["batch_size"]
+    if kind == "reachable" and values["num_rounds"] and batch != 1:
+        raise ConfigError(
+            f"{name}.batch_size: is {batch}, but in a pool of kind 'reachable' each view is "
+            "reached from the one before: give 1, and more num_rounds, as configs/reachable.py does"
+        )
+    is_free = values["loader"] == "procedural" and values["candidates.source"] == "hemisphere"
+    if is_free and kind in ("unbalanced", "zoom"):
+        raise ConfigError(
+            f"{name}.candidates.source: is 'hemisphere', whose free poses are of no pool, but "
+            f"pool.kind is {kind!r}: give candidates.source 'dataset', or pool.kind 'even'"
+        )
 
 
 def check_options(config: ConfigDict, schema: dict[str, Option], name: str) -> dict:

@@ -35,7 +35,7 @@ BAD = (
 )
 ZERO_IS_FINE = {
     *("image_size", "load.downscale", "load.pool_size", "load.test_every", "load.seed"),
-    *("num_initial", "num_rounds", "num_test", "num_test_final", "num_pictures"),
+    *("pool.seed", "num_initial", "num_rounds", "num_test", "num_test_final", "num_pictures"),
     *("checkpoint_seconds", "hash_grid.appearance_features", "nerf_mlp.skip", "mip_mlp.skip"),
     *("flow_training.entropy_weight", "proposal.anneal_steps", "proposal.interlevel_weight"),
     *("proposal.distortion_weight", "proposal.penalty_weight", "train.learning_rate"),
@@ -128,6 +128,8 @@ def test_where_nothing_is_given_the_default_is_none():
 
 DRAWN = {"candidates__source": "hemisphere", "candidates__hemisphere_draws": 100}
 
+FREE = {"candidates__source": "hemisphere"}  # poses, of the procedural scene
+
 
 def type_of(option):
     *groups, name = option.split(".")
@@ -163,10 +165,31 @@ def test_an_option_that_is_a_group_or_missing_or_unknown_is_named():
         ("hash_grid.finest", 8, "is 8; give at least hash_grid.coarsest, 16"),
         ("proposal.finest", (8, 64), "give at least proposal.coarsest, 16"),
         ("candidates.min_train_distance", 0.5, "give both min_train_distance and"),
+        ("pool.kind", "uneven", "is 'uneven'; give one of 'even', 'unbalanced', 'arc', "),
+        ("pool.share", 0.33, "is 0.33; give a number from 1/3 to below 1"),
+        ("pool.share", 1.0, "is 1.0; give a number from 1/3 to below 1"),
+        ("pool.degrees", 361.0, "is 361.0; give a number above 0 to 360"),
+        ("pool.factor", 1.0, "is 1.0; give a number above 1 to 100"),
+        ("pool.num_nearest", 2.0, "is 2.0; give a whole number from 1 to"),
     ],
 )
 def test_messages_name_the_option_the_value_and_the_fix(option, value, message):
     assert re.search(message, refusal(option, value))
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"pool__kind": "reachable"}, r"config\.batch_size: is 2, .* give 1, and more num_rounds"),
+        ({"pool__kind": "zoom"} | FREE, r"config\.candidates\.source: is 'hemisphere'.* 'zoom'"),
+        ({"pool__kind": "unbalanced"} | FREE, r"config\.candidates\.source: is .*'unbalanced'"),
+    ],
+)
+def test_a_pool_that_does_not_go_with_other_options_is_refused(options, message):
+    with pytest.raises(ConfigError, match=message):
+        check_config(toy_config(**options))
+    mended = {"num_rounds": 0} if "batch_size" in message else {"loader": "blender"}
+    check_config(toy_config(**options | mended))
 
 
 @pytest.mark.parametrize("name", leaves(default_sizes()))

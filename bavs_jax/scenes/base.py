@@ -50,6 +50,7 @@ class Scene:
     depth: np.ndarray | None = None  # [N] float32 distance along the ray, 0 where unknown or empty
     pixel_mask: np.ndarray | None = None  # [N] bool, False: ignore this pixel
     alpha: np.ndarray | None = None  # [N] uint8 opacity of the photos; None: all opaque
+    start: np.ndarray | None = None  # [S] int32 views of the pool that runs begin with; None: any
     unbounded: bool = False  # content reaches beyond the box, as in most real captures
     photo_sizes: np.ndarray | None = None  # [V, 2] int32 pixels of the files; None: not reduced
     # [4, 4] float64 similarity from scene coordinates to those of the user's own file.

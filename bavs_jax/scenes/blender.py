@@ -7,6 +7,7 @@ import numpy as np
 
 from bavs_jax.scenes import checks, images, texts
 from bavs_jax.scenes.base import Scene, SceneError, alpha_table, pixel_table, printable
+from bavs_jax.scenes.zoom import Zoom, check_zoom, cut, magnifications, photo_windows
 
 BOX_HALF_SIDE = 1.5  # scene units; the objects of this data set fit into it
 NEAR, FAR = 2.0, 6.0  # scene units
@@ -24,8 +25,13 @@ def decode_depth(values: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     return np.where((values > 0) & (alpha > 0), depth, np.float32(0.0))
 
 
-def load_depth(image_path: pathlib.Path, image: np.ndarray, size) -> np.ndarray | None:
-    """One view's depth [H, W] at `size` (width, height), or None where it has no file."""
+def load_depth(
+    image_path: pathlib.Path, image: np.ndarray, size, window: np.ndarray
+) -> np.ndarray | None:
+    """One view's depth [H, W] at `size` (width, height), or None where it has no file.
+
+    It is that of the part of the image that a window (see `zoom.photo_windows`) shows.
+    """
     path = find_depth(image_path)
     if path is None:
         return None
@@ -34,11 +40,23 @@ def load_depth(image_path: pathlib.Path, image: np.ndarray, size) -> np.ndarray 
         values.shape[::-1], (image.shape[1], image.shape[0]), path, image_path.name
     )
     alpha = image[..., 3] if image.shape[-1] == 4 else np.full_like(values, 255)
-    return images.nearest_resize(decode_depth(values, alpha), *size)
+    return images.nearest_resize(cut(decode_depth(values, alpha), window), *size)
 
 
-def load_split(root: pathlib.Path, split: str, *, image_size, background, strict: bool) -> dict:
-    """Loads one `transforms_<split>.json`: a dict of lists with one entry per view."""
+def load_split(
+    root: pathlib.Path,
+    split: str,
+    *,
+    image_size,
+    background,
+    strict: bool,
+    zoom: Zoom | None,
+    first: int = 0,
+) -> dict:
+    """Loads one `transforms_<split>.json`: a dict of lists with one entry per view.
+
+    `first` is the number of the split's first view; for the rest see `load_blender`.
+    """
     path = root / f"transforms_{split}.json"
     data = texts.read_json(path)
     frames = checks.check_frames(data, path)
@@ -54,7 +72,7 @@ def load_split(root: pathlib.Path, split: str, *, image_size, background, strict
     fields = ("poses", "intrinsics", "images", "depths", "files", "names", "sizes")
     views: dict[str, list] = {field: [] for field in fields}
     original = None
-    for index in kept:
+    for index, ratio in zip(kept, magnifications(zoom, len(kept), first)):
         field = f"frames[{index}].transform_matrix"
         views["poses"].append(checks.check_pose(frames[index].get("transform_matrix"), path, field))
         image = images.read_image(files[index])
@@ -63,13 +81,16 @@ def load_split(root: pathlib.Path, split: str, *, image_size, background, strict
         checks.check_image_size((width, height), original, files[index], "the split's first image")
 
         new_width = checks.check_target_width(image_size, width, files[index])
+        if zoom is not None:
+            check_zoom(zoom, new_width / width, width, files[index])
+        (window,) = photo_windows([(width, height)], [ratio])
         size = (new_width, max(round(height * new_width / width), 1))
-        views["images"].append(images.shrink_over(image, *size, background))
-        views["depths"].append(load_depth(files[index], image, size))
+        views["images"].append(images.shrink_over(cut(image, window), *size, background))
+        views["depths"].append(load_depth(files[index], image, size, window))
+        scale = size / (window[1] - window[0])
         focal = 0.5 * width / math.tan(0.5 * angle)  # pixels are square in the original
-        views["intrinsics"].append(
-            [focal * size[0] / width, focal * size[1] / height, 0.5 * size[0], 0.5 * size[1]]
-        )
+        centre = 0.5 * np.array([width, height]) - window[0]
+        views["intrinsics"].append([*(focal * scale), *(centre * scale)])
         views["sizes"].append((width, height))
         views["files"].append(files[index])
         views["names"].append(checks.view_name(files[index], root))
@@ -79,7 +100,12 @@ def load_split(root: pathlib.Path, split: str, *, image_size, background, strict
 
 @checks.name_refusals
 def load_blender(
-    root, *, image_size: int | None = None, background=(1.0, 1.0, 1.0), strict: bool = False
+    root,
+    *,
+    image_size: int | None = None,
+    background=(1.0, 1.0, 1.0),
+    strict: bool = False,
+    zoom: Zoom | None = None,
 ) -> Scene:
     """Loads a scene in the layout of NeRF-synthetic, in the file's own coordinates.
 
@@ -90,16 +116,19 @@ def load_blender(
       image_size: wanted width in pixels, at most the original; the height keeps the proportion.
       background: [3] sRGB in [0, 1] to put under transparent pixels.
       strict: an image without a file is an error, not a warning.
+      zoom: gives every view, those to test on too, a longer lens by a factor of its own; None
+        takes photos whole.
 
     Raises:
       SceneError: anything in the files that cannot be used.
     """
     root = checks.scene_folder(root)
-    options = {"image_size": image_size, "background": background, "strict": strict}
+    options = {"image_size": image_size, "background": background, "strict": strict, "zoom": zoom}
     train = load_split(root, "train", **options)
-    test = load_split(root, "test", **options)
+    num_train = len(train["names"])
+    test = load_split(root, "test", first=num_train, **options)
     views = {name: train[name] + test[name] for name in train}
-    num_train, num_views = len(train["names"]), len(views["names"])
+    num_views = len(views["names"])
     for view in sorted(set(train["names"]) & set(test["names"])):
         raise SceneError(
             f"{root / 'transforms_test.json'}: '{view}' is also in transforms_train.json: "

@@ -12,6 +12,7 @@ from bavs_jax.scenes.base import Scene, SceneError, alpha_table, pixel_table, pr
 from bavs_jax.scenes.extent import scene_extent
 from bavs_jax.scenes.poses import level_and_scale, transform_poses
 from bavs_jax.scenes.splits import choose_split
+from bavs_jax.scenes.zoom import Zoom, check_zoom, cut, cut_cameras, magnifications, photo_windows
 
 Split = tuple[Sequence[int], Sequence[int]]  # views of the pool, and views to test on
 # Depth [H, W] of an image of a given (width, height), in the unit of the files.
@@ -52,6 +53,7 @@ def make_scene(
     far: float | None = None,
     unbounded: bool = True,
     background=(1.0, 1.0, 1.0),
+    zoom: Zoom | None = None,
 ) -> Scene:
     """Levels, centres and scales a capture's cameras, reads its images and splits its views.
 
@@ -73,6 +75,8 @@ def make_scene(
         the box.
       unbounded: whether content reaches beyond the box.
       background: [3] sRGB in [0, 1] to put under transparent pixels.
+      zoom: gives every view, those to test on too, a longer lens by a factor of its own; None
+        takes photos whole.
 
     Raises:
       SceneError: anything in the files that cannot be used.
@@ -89,12 +93,15 @@ def make_scene(
 
     widest = int(capture.cameras.sizes[:, 0].max())
     factor = checks.check_target_width(image_size, widest, source) / widest
-    cameras = rescale(
-        capture.cameras, np.maximum(np.rint(capture.cameras.sizes * factor), 1)
-    ).replace(world_from_cam=transform_poses(scene_from_file, capture.poses).astype(np.float32))
+    if zoom is not None:
+        check_zoom(zoom, factor, widest, source)
+    sizes = np.maximum(np.rint(capture.cameras.sizes * factor), 1)
+    windows = photo_windows(capture.cameras.sizes, magnifications(zoom, num_views))
+    poses = transform_poses(scene_from_file, capture.poses).astype(np.float32)
+    cameras = rescale(cut_cameras(capture.cameras, windows), sizes).replace(world_from_cam=poses)
 
     near, far, box = scene_extent(
-        cameras,
+        rescale(capture.cameras, sizes).replace(world_from_cam=poses),
         None if capture.bounds is None else unit * capture.bounds,
         box_half_side=box_half_side,
         near=near,
@@ -103,12 +110,15 @@ def make_scene(
         path=source,
     )
     shrunk = [
-        images.shrink_over(images.read_image(file), int(width), int(height), background)
-        for file, (width, height) in zip(capture.files, cameras.sizes)
+        images.shrink_over(
+            cut(images.read_image(file), window), int(width), int(height), background
+        )
+        for file, window, (width, height) in zip(capture.files, windows, cameras.sizes)
     ]
     pixels, offsets = pixel_table([colour for colour, _ in shrunk])
     names = tuple(checks.view_name(file, capture.root) for file in capture.files)
-    depth, pixel_mask = depth_table(capture, cameras, unit), mask_table(capture, cameras, names)
+    depth = depth_table(capture, cameras, unit, windows)
+    pixel_mask = mask_table(capture, cameras, names, windows)
     images.look_over(capture.files, capture.root, source)
     return Scene(
         name=printable(capture.root.resolve().name),
@@ -131,10 +141,18 @@ def make_scene(
     )
 
 
-def mask_table(capture: Capture, cameras: Cameras, names: tuple[str, ...]) -> np.ndarray | None:
+def mask_table(
+    capture: Capture, cameras: Cameras, names: tuple[str, ...], windows: np.ndarray
+) -> np.ndarray | None:
     """`Scene.pixel_mask` at the sizes of `cameras`, or None where every pixel counts.
 
     What a mask leaves out does not count, nor what lies beyond the range of the lens.
+
+    Args:
+      capture: names the mask of each view.
+      cameras: [V] at the sizes of the table.
+      names: [V] of the views, for messages.
+      windows: [V, 2, 2] the part of each photo that the cameras see, pixels of the files.
     """
     shown = folds.shown_masks(cameras, names, capture.source)
     if not capture.masks:
@@ -143,7 +161,7 @@ def mask_table(capture: Capture, cameras: Cameras, names: tuple[str, ...]) -> np
     for view, path in enumerate(capture.masks):
         width, height = (int(n) for n in capture.cameras.sizes[view])
         mask = maps.read_mask(path, (width, height), capture.files[view])
-        mask = maps.shrink_mask(mask, *(int(n) for n in cameras.sizes[view]))
+        mask = maps.shrink_mask(cut(mask, windows[view]), *(int(n) for n in cameras.sizes[view]))
         if shown is not None:
             mask &= shown[view]
         if not mask.any():
@@ -156,13 +174,16 @@ def mask_table(capture: Capture, cameras: Cameras, names: tuple[str, ...]) -> np
     return pixel_table(table)[0]
 
 
-def depth_table(capture: Capture, cameras: Cameras, unit: float) -> np.ndarray | None:
+def depth_table(
+    capture: Capture, cameras: Cameras, unit: float, windows: np.ndarray
+) -> np.ndarray | None:
     """`Scene.depth` at the sizes of `cameras`, or None where no view has depth.
 
     Args:
       capture: names the depth of each view.
       cameras: [V] in scene coordinates, at the sizes of the table.
       unit: scene units per unit of the capture.
+      windows: see `mask_table`.
     """
     if not any(capture.depths):
         return None
@@ -174,6 +195,7 @@ def depth_table(capture: Capture, cameras: Cameras, unit: float) -> np.ndarray |
             continue
         full_width, full_height = (int(n) for n in capture.cameras.sizes[view])
         depth = read_fn((full_width, full_height))
-        depth = images.nearest_resize(unit * depth, width, height).astype(np.float32)
+        part = windows[view] / (full_width, full_height)  # a map may be smaller than the photo
+        depth = images.nearest_resize(unit * depth, width, height, part=part).astype(np.float32)
         table.append(depth if capture.depth_along_ray else maps.along_rays(depth, cameras, view))
     return pixel_table(table)[0]

@@ -252,15 +252,25 @@ def area_resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return box_filter(box_filter(image, height).swapaxes(0, 1), width).swapaxes(0, 1)
 
 
-def nearest_resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
+def nearest_resize(
+    image: np.ndarray, width: int, height: int, *, part=((0.0, 0.0), (1.0, 1.0))
+) -> np.ndarray:
     """Down-scales by taking the sample at each new pixel's centre.
 
     Right for depth, where an average across a silhouette lies on neither surface. A centre that
     falls between two samples takes the one to the right or below.
+
+    Args:
+      image: [H, W, ...].
+      width, height: of the result, pixels.
+      part: [2, 2] the corners of what is taken, as shares of the image's width and height.
     """
-    row = ((np.arange(height) + 0.5) * image.shape[0] / height).astype(int)
-    column = ((np.arange(width) + 0.5) * image.shape[1] / width).astype(int)
-    return image[row[:, None], column[None, :]]
+    low, extent = np.asarray(part)[0], np.diff(part, axis=0)[0]
+    samples = [
+        ((low[axis] * num + (np.arange(num) + 0.5) * extent[axis]) * size / num).astype(int)
+        for axis, (num, size) in enumerate(((width, image.shape[1]), (height, image.shape[0])))
+    ]
+    return image[samples[1][:, None], samples[0][None, :]]
 
 
 def strips(num: int, across: int) -> list[slice]:

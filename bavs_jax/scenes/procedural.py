@@ -26,9 +26,11 @@ from bavs_jax.cameras import (
 )
 from bavs_jax.scenes import sculpture, sdf
 from bavs_jax.scenes.base import Scene, SceneError
+from bavs_jax.scenes.zoom import Zoom, magnifications
 
 SOURCE_VERSION = 3  # raise it when the look of the scene changes: caches are then made anew
 CAMERA_RADIUS = 3.2  # scene units
+NEAR = 0.05  # scene units; least distance of a camera to what it may see
 FIELD_OF_VIEW = 0.64  # radians across the width; holds the whole object from every side
 BACKGROUND = (1.0, 1.0, 1.0)
 MAX_PIXELS = 1 << 28  # of all views; each takes some 40 bytes on the way
@@ -194,6 +196,23 @@ def hemisphere_cameras(key: jax.Array, num: int, *, image_size: int) -> Cameras:
     return make_cameras(poses, intrinsics, [[image_size, image_size]] * num)
 
 
+def at_distances(cameras: Cameras, zoom: Zoom | None) -> tuple[Cameras, float, float]:
+    """Cameras moved along their lines of sight; their least and their largest possible distance."""
+    factor = 1.0 if zoom is None else zoom.factor
+    nearest, farthest = (CAMERA_RADIUS * factor**power for power in (-0.5, 0.5))
+    if nearest < sculpture.SCENE_RADIUS + NEAR:
+        largest = (CAMERA_RADIUS / (sculpture.SCENE_RADIUS + NEAR)) ** 2
+        raise SceneError(
+            f"procedural: pool.factor: zoom by {factor:g} puts cameras inside of the scene: "
+            f"give at most {np.floor(10.0 * largest) / 10.0:g}"
+        )
+    poses = np.array(cameras.world_from_cam)
+    # A larger picture from the same direction is one from nearer by.
+    scale = factor**0.5 / magnifications(zoom, len(cameras))
+    poses[:, :, 3] *= scale[:, None].astype(np.float32)
+    return cameras.replace(world_from_cam=poses), nearest, farthest
+
+
 def read_cache(path: pathlib.Path, num_pixels: int) -> Photos | None:
     """Photos from a cache file; None, after a warning, where it is damaged."""
     try:
@@ -232,6 +251,7 @@ def load_procedural(
     num_test: int = 25,
     cache_dir=None,
     seed: int = 0,
+    zoom: Zoom | None = None,
 ) -> Scene:
     """Makes the scene that comes with the project: images and exact depth of the sculpture.
 
@@ -241,9 +261,13 @@ def load_procedural(
       num_test: views that are only measured; from another random key.
       cache_dir: a folder that keeps the images for the next time, or None.
       seed: draws the poses.
+      zoom: moves every camera, those to test with too, along its line of sight to a distance of its
+        own, between `1 / sqrt(factor)` and `sqrt(factor)` times the common one; None leaves all
+        there. They do not come nearer than just outside of the ball that holds the sculpture.
 
     Raises:
-      SceneError: a size or count below 1, a seed below 0, or more than `MAX_PIXELS` in all.
+      SceneError: a size or count below 1, a seed below 0, more than `MAX_PIXELS` in all, or cameras
+        that would be inside of the ball.
     """
     for field, value, least in (
         ("image_size", image_size, 1),
@@ -265,11 +289,12 @@ def load_procedural(
     train = hemisphere_cameras(key_train, num_train, image_size=image_size)
     test = hemisphere_cameras(key_test, num_test, image_size=image_size)
     cameras = jax.tree.map(lambda a, b: np.concatenate([a, b]), train, test)
-
     num_views = num_train + num_test
+    cameras, nearest, farthest = at_distances(cameras, zoom)
+
     cached, path = None, None
     if cache_dir is not None:
-        arguments = [SOURCE_VERSION, image_size, num_train, num_test, seed]
+        arguments = [SOURCE_VERSION, image_size, num_train, num_test, seed, *(zoom or ())]
         digest = hashlib.sha256(json.dumps(arguments).encode()).hexdigest()[:16]
         path = pathlib.Path(cache_dir).expanduser() / f"procedural-{digest}.npz"
         cached = read_cache(path, num_pixels)
@@ -288,8 +313,8 @@ def load_procedural(
         pool=np.arange(num_train, dtype=np.int32),
         test=np.arange(num_train, num_views, dtype=np.int32),
         box=np.array([[-1.0] * 3, [1.0] * 3], np.float32),
-        near=CAMERA_RADIUS - np.sqrt(3.0),  # the box's corners
-        far=CAMERA_RADIUS + np.sqrt(3.0),
+        near=max(nearest - np.sqrt(3.0), NEAR),  # the box's corners
+        far=farthest + np.sqrt(3.0),
         background=np.array(BACKGROUND, np.float32),
         names=tuple(
             [f"train_{i:03d}" for i in range(num_train)]

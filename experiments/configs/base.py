@@ -22,6 +22,18 @@ def get_config() -> ConfigDict:
     config.load.seed = 0  # draws the pool
     config.load.split = placeholder(str)  # of loader "lightfield"; see scenes/lightfield.py
 
+    # --- the pool: which views are on offer, and where a run begins (bavs_jax/scenes/pools.py) ---
+    config.pool = ConfigDict()
+    # "even": all of it. "unbalanced": most of it in one of three bands of elevation. "arc": runs
+    # begin with views of one side. "reachable": the nearest to the view taken last, one in a round.
+    # "zoom": free distance, in the test views too; photos larger than image_size, or "procedural".
+    config.pool.kind = "even"
+    config.pool.seed = 0  # draws which band, which side, and every view's distance
+    config.pool.share = 0.75  # of "unbalanced": of its views, in the crowded band
+    config.pool.degrees = 60.0  # of "arc": of azimuth, between any two initial views
+    config.pool.num_nearest = 5  # of "reachable": unused views on offer
+    config.pool.factor = 3.0  # of "zoom": from the farthest to the nearest view
+
     # --- the experiment ---
     config.policies = ("bavs", "random")  # see --list_policies; the first one's views are exported
     config.seeds = (0,)

@@ -6,6 +6,7 @@ import json
 import os
 from pathlib import Path
 
+from bavs_jax.scenes.pools import BANDS, crowded_band
 from experiments.reporting import pictures, plots, results, run_tables, stats
 from experiments.reporting.camera_map import map_plot
 from experiments.reporting.page import FOLDER, write_template
@@ -49,6 +50,7 @@ def write_report(workdir: str | os.PathLike) -> Path:
         path,
         FOLDER / "report.html",
         runs=runs,
+        pool=next((pool_words(run.result.get("config", {}).get("pool", {})) for run in runs), ""),
         policies=policies,
         headline=make_headline(runs, policies),
         curves=curves,
@@ -85,6 +87,23 @@ def _maps(runs: list[results.Run]) -> dict[str, tuple]:
             svg = map_plot(arrays, salt=f"map{number}")
             maps[run.label] = svg, run_tables.choices_table(run, arrays)
     return maps
+
+
+def pool_words(pool: dict) -> str:
+    """What the pool of a config is, in a sentence; empty where it is even."""
+    kind = pool.get("kind", "even")
+    if kind == "even":
+        return ""
+    if kind == "unbalanced":
+        band = BANDS[crowded_band(pool["seed"])]
+        words = f"{100 * pool['share']:g} % of it in the {band} of three bands of elevation"
+    elif kind == "arc":
+        words = f"runs begin with views within {pool['degrees']:g} degrees of azimuth"
+    elif kind == "reachable":
+        words = f"on offer are the {pool['num_nearest']} unused views nearest to the last one"
+    else:
+        words = f"distances differ by a factor of up to {pool['factor']:g}, in test views too"
+    return f"Pool: {kind}, seed {pool['seed']}: {words}."
 
 
 def make_headline(runs: list[results.Run], policies: list[str]) -> tuple[str, str]:
