@@ -4,11 +4,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from bavs_jax.arrays import Array
 
 DEFAULT_RADIUS = 0.2  # of the median camera distance from the scene centre
 DEFAULT_SHRINK = 0.8
+GAP_SHRINK = 0.95  # of the least distance in `far_from_chosen`
 DEFAULT_MAX_SHRINKS = 32  # radii end at 0.8^32 < 1e-3 of where they began
 
 
@@ -153,6 +155,32 @@ def max_min_filter(
         fell_back=fell_back,
     )
     return jnp.zeros_like(mask).at[visit].set(kept), info
+
+
+def far_from_chosen(
+    nearest, mask, num_wanted: int, *, shrink: float = GAP_SHRINK, max_shrinks: int = 256
+) -> np.ndarray:
+    """Candidates at least tau from all chosen views, [C] bool within `mask`.
+
+    Tau starts at the largest gap, the largest of the distances, and is multiplied by `shrink` until
+    as many as are wanted remain.
+
+    Args:
+      nearest: [C] distance of each candidate to the nearest chosen view; infinity where there is
+        none.
+      mask: [C] bool.
+      num_wanted: how many have to remain; all of `mask` do if it has no more, or if `max_shrinks`
+        are not enough.
+      shrink: in (0, 1).
+    """
+    nearest, mask = np.asarray(nearest, np.float64), np.asarray(mask)
+    tau = nearest[mask].max(initial=0.0)
+    for _ in range(max_shrinks):
+        far = mask & (nearest >= tau)
+        if far.sum() >= num_wanted:
+            return far
+        tau *= shrink
+    return mask
 
 
 def farthest_ranks(
