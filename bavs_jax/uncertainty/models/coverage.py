@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.arrays import Array
+from bavs_jax.cameras import num_pixels
 from bavs_jax.devices import jit_over_rays
 from bavs_jax.rendering.images import render_views
 from bavs_jax.rendering.render import Channel, RayRendering, basic_images
@@ -119,11 +120,14 @@ def make_surface_fn(setup: SceneSetup) -> Callable[..., Surface]:
 
     def surface_of(train, lookers):
         is_surface = np.zeros(grid.cells**3 + 1, bool)  # the last one stands for no cell
-        for view in np.flatnonzero(lookers.mask):  # one by one: all samples of an image are large
-            (image,) = render_views(
-                partial(compiled, train.model), lookers.cameras, [view], chunk=setup.chunk
-            )
-            is_surface[image["cells"]] = True
+        views = np.flatnonzero(lookers.mask)
+        # As many as fill a call: all samples of all images would be large.
+        at_once = max(1, setup.chunk // int(num_pixels(lookers.cameras)[0]))
+        for start in range(0, len(views), at_once):
+            some = views[start : start + at_once]
+            fn = partial(compiled, train.model)
+            for image in render_views(fn, lookers.cameras, some, chunk=setup.chunk):
+                is_surface[image["cells"]] = True
         depths = lookers.depth_maps[lookers.opacity_maps >= OPAQUE]
         # Where nothing is opaque nothing is far.
         reference = np.median(depths) if len(depths) else np.finfo(np.float32).max
