@@ -147,6 +147,15 @@ def scene_hemisphere(key, scene: Scene, num: int) -> np.ndarray:
     return hemisphere_poses(key, num, centre=scene.centre, radius=radius, up=scene.up)
 
 
+def candidate_cameras(scene: Scene, poses) -> Cameras:
+    """The poses as cameras with the lens of a photo whose image size is the commonest."""
+    sizes = np.asarray(scene.cameras.sizes)
+    _, first, counts = np.unique(sizes, axis=0, return_index=True, return_counts=True)
+    cameras = jax.tree.map(np.asarray, scene.cameras)
+    cameras = take(cameras, np.full(len(poses), first[counts.argmax()]))
+    return cameras.replace(world_from_cam=np.asarray(poses, np.float32))
+
+
 def with_empty_views(table: PixelTable, num: int) -> PixelTable:
     """A pixel table with room for `num` more pictures, sized like its first view.
 

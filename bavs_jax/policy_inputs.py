@@ -16,7 +16,12 @@ from bavs_jax.fields.deformation import vertex_positions, vertices_in_box
 from bavs_jax.pixel_table import PixelTable
 from bavs_jax.progress import Track
 from bavs_jax.scenes.images import area_resize
-from bavs_jax.selection.directional import DirectionalInformation, Look, make_precision_fn
+from bavs_jax.selection.directional import (
+    DirectionalInformation,
+    Look,
+    LookFn,
+    make_precision_fn,
+)
 from bavs_jax.selection.information import (
     DEFAULT_MAX_BYTES,
     CurvatureFn,
@@ -25,6 +30,7 @@ from bavs_jax.selection.information import (
     make_cached_curvature_fn,
 )
 from bavs_jax.selection.policy import Policy
+from bavs_jax.target_inputs import MakeTargets, evenly_spaced_cameras, target_information
 from bavs_jax.uncertainty.channel import mean_uncertainty
 from bavs_jax.uncertainty.measures import TrueErrorFn
 from bavs_jax.uncertainty.model import Acquired, ModelFns, SceneSetup
@@ -41,6 +47,7 @@ class LookOptions(NamedTuple):
     image_scale: float  # of width and height, for the score (Eq 15)
     chunk: int  # rays of one compiled call
     cache_bytes: int = 2**30  # most memory for curvatures of candidates; the others are made anew
+    num_targets: int = 32  # most target views, evenly spaced among those there are
 
 
 class PolicyInputs(NamedTuple):
@@ -66,6 +73,7 @@ class InputMaker:
         *,
         track: Track,
         true_error_fn: TrueErrorFn | None = None,
+        make_targets: MakeTargets = lambda key: None,
     ):
         """Makes nothing yet.
 
@@ -75,9 +83,11 @@ class InputMaker:
           options: how candidates are looked at.
           track: shows progress.
           true_error_fn: of a training state; None where candidates have no photos.
+          make_targets: the views that policies by target information ask about.
         """
         self.setup, self.model_fns, self.options = setup, model_fns, options
         self.track, self.true_error_fn = track, true_error_fn
+        self.make_targets = make_targets
 
     def __call__(
         self, policy: Policy, key, acquired: Acquired, candidates: Candidates
@@ -88,6 +98,7 @@ class InputMaker:
             "mean_uncertainty_fn": self._mean_uncertainty,
             "information": self._information,
             "directional": self._directional,
+            "targets": self._targets,
         }
         if self.true_error_fn is not None:
             makers["true_error_fn"] = partial(self._true_error, self.true_error_fn)
@@ -145,6 +156,30 @@ class InputMaker:
                 max_bytes=self.options.cache_bytes,
             )
 
+    def _targets(self, policy, key, acquired, candidates, seconds):
+        options, cameras = self.options, candidates.cameras
+        look_fn = target_fn = make_look_fn(
+            cameras, self._candidate_curvature(acquired, candidates, seconds)
+        )
+        given, view_ids = self.make_targets(key), candidates.view_ids
+        if given is not None:
+            cameras, view_ids = given, None
+            curvature_fn = self._candidate_curvature(
+                acquired, candidates._replace(cameras=given), seconds
+            )
+            target_fn = make_look_fn(given, curvature_fn)
+        rows = evenly_spaced_cameras(cameras.positions, options.num_targets, view_ids=view_ids)
+        with _clock(seconds, "curvature"):
+            return target_information(
+                self.setup,
+                acquired.num_rays,
+                training_looks(self.setup, acquired, options.image_scale),
+                look_fn,
+                lambda numbers: target_fn(rows[numbers]),
+                take(cameras, rows),
+                max_bytes=options.cache_bytes,
+            )
+
     def _true_error(self, true_error_fn, policy, key, acquired, candidates, seconds):
         return lambda indices: true_error_fn(acquired.train, candidates.view_ids[indices])
 
@@ -183,12 +218,7 @@ def directional_information(
       image_scale: of the training views' width and height, as for candidates.
       max_bytes: of host memory for precisions that are kept from pick to pick.
     """
-    positions = np.asarray(cameras.positions)
-
-    def look_fn(indices):
-        for index, (rows, h) in zip(indices, curvature_fn(indices)):
-            yield Look(rows, h, positions[index])
-
+    look_fn = make_look_fn(cameras, curvature_fn)
     precision_fn = make_precision_fn(
         look_fn,
         vertex_positions(setup.grid),
@@ -198,6 +228,17 @@ def directional_information(
     return DirectionalInformation(
         training_looks(setup, acquired, image_scale), look_fn, precision_fn
     )
+
+
+def make_look_fn(cameras: Cameras, curvature_fn: CurvatureFn) -> LookFn:
+    """Makes the looks of cameras, one after another, from their curvatures."""
+    positions = np.asarray(cameras.positions)
+
+    def look_fn(indices):
+        for index, (rows, h) in zip(indices, curvature_fn(indices)):
+            yield Look(rows, h, positions[index])
+
+    return look_fn
 
 
 def training_looks(setup: SceneSetup, acquired: Acquired, image_scale: float) -> tuple[Look, ...]:

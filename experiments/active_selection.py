@@ -37,7 +37,7 @@ flags.DEFINE_bool("list_policies", False, "Print the known acquisition policies 
 def main() -> None:
     if FLAGS.list_policies:
         for name, policy in POLICIES.items():
-            print(f"{name:16} {policy.summary}")
+            print(f"{name:24} {policy.summary}")
         return
     config = given_config("experiments/configs/quickstart.py")
     folder = runtime.given_folder("workdir", "a folder for the results")

@@ -47,6 +47,7 @@ from experiments.build_model import (
     only,
     train_aside,
 )
+from experiments.build_targets import build_targets
 from experiments.runtime import ConfigError
 from experiments.runtime import track as show_progress
 
@@ -217,6 +218,7 @@ class Problem:
         else:
             self.source = dataset_candidates(scene, hemisphere_draws=draws)
         self.table = put_on_all(table, mesh)
+        self.make_targets = build_targets(config, scene)
         # The distribution over fields whose mean is the field of kind FLOW.
         self.flow = flow = build_flow(config, scene)
         num_views = len(table.cameras)
@@ -309,14 +311,23 @@ class Problem:
     @cached_property
     def inputs(self) -> InputMaker:
         """Where the numbers of policies come from."""
-        look = LookOptions(image_scale=self.config.candidates.image_scale, chunk=RENDER_CHUNK)
+        look = LookOptions(
+            image_scale=self.config.candidates.image_scale,
+            chunk=RENDER_CHUNK,
+            num_targets=self.config.targets.num,
+        )
         true_error_fn = None
         if not self.has_empty_views:
             true_error_fn = make_true_error_fn(
                 self.render, self.scene, image_scale=look.image_scale, chunk=look.chunk
             )
         return InputMaker(
-            self.setup, self.model_fns, look, track=self.track, true_error_fn=true_error_fn
+            self.setup,
+            self.model_fns,
+            look,
+            track=self.track,
+            true_error_fn=true_error_fn,
+            make_targets=self.make_targets,
         )
 
     def acquisition(

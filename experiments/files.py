@@ -317,7 +317,8 @@ def modern(saved: dict) -> dict:
             group[name] = modern_value(option, group[name])
     if type(saved.get("view_seed")) is str:  # a seed was written as text
         saved["view_seed"] = int(saved["view_seed"])
-    saved.setdefault("pool", base.get_config().pool.to_dict())  # all of them were even
+    for group in ("pool", "targets"):  # what all did before they could be asked otherwise
+        saved.setdefault(group, base.get_config()[group].to_dict())
     return saved
 
 

@@ -22,6 +22,7 @@ from bavs_jax.uncertainty.conformal_scale import SCALES as INTERVAL_SCALES
 from bavs_jax.uncertainty.curvature import WEIGHTINGS
 from bavs_jax.uncertainty.models import MODELS
 from experiments.build_model import SAMPLERS
+from experiments.build_targets import TARGET_KINDS
 from experiments.files import leaves, modern_value
 from experiments.runtime import ConfigError, one_line, shown
 
@@ -116,6 +117,7 @@ _OPTIONS_OF_A_KIND = {
     "load.strict from_scratch train.random_background evaluation.scale_depth": FLAG,
     "scene": TEXT,
     "data_dir": default(TEXT, "$BAVS_DATA/<loader>"),
+    "targets.poses_file": default(TEXT, "no file"),
     # words
     "loader": choice(*LOADERS, "auto"),
     "load.split": default(choice(*SPLITS), AS_LOADED),
@@ -128,6 +130,7 @@ _OPTIONS_OF_A_KIND = {
     "uncertainty.variant": choice(*VARIANTS),
     "uncertainty.scale": choice(*SCALES),
     "uncertainty.extent": choice(*EXTENTS),
+    "targets.kind": choice(*TARGET_KINDS),
     "evaluation.variant": choice(*AUSE_VARIANTS),
     "evaluation.interval_scale": choice(*INTERVAL_SCALES),
     "candidates.source": choice("dataset", "hemisphere"),
@@ -153,7 +156,7 @@ _OPTIONS_OF_A_KIND = {
     "pool.factor": number(1.0, 100.0, above=True),
     "image_size": whole(1, MAX_WIDTH, "as the files are"),
     "num_initial": views("all of the pool"),
-    "batch_size candidates.hemisphere_draws": views(),
+    "batch_size candidates.hemisphere_draws targets.num": views(),
     "num_rounds": whole(0, 10_000),
     "num_test num_test_final num_pictures": views("all"),
     "evaluation.num_views evaluation.num_interval_views": views("all"),
@@ -249,6 +252,10 @@ def check_config(config: ConfigDict, *more: str, name: str = "config") -> Config
             "or neither"
         )
     check_pool(values, name)
+    if (values["targets.kind"] == "file") != bool(values["targets.poses_file"]):
+        raise ConfigError(
+            f"{name}.targets.poses_file: goes with {name}.targets.kind='file'; give both or neither"
+        )
     return config
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.cameras import Cameras, hemisphere_poses, num_pixels, reduced_cameras, take
-from bavs_jax.candidates import Candidates
+from bavs_jax.candidates import Candidates, candidate_cameras
 from bavs_jax.placement.clearance import judge_positions, matter_density, within_bounds
 from bavs_jax.placement.collect import PlacementError, Proposals, check_enough, collect_poses
 from bavs_jax.placement.proposals import aim, box_positions, shell_positions, turned_targets
@@ -266,15 +266,6 @@ def gaze_between(directions) -> np.ndarray:
     middle = directions.mean(axis=1)
     length = np.linalg.norm(middle, axis=-1, keepdims=True)
     return np.where(length > OPPOSITE, middle / np.maximum(length, OPPOSITE), directions[:, 0])
-
-
-def candidate_cameras(scene: Scene, poses) -> Cameras:
-    """The poses as cameras with the lens of a photo whose image size is the commonest."""
-    sizes = np.asarray(scene.cameras.sizes)
-    _, first, counts = np.unique(sizes, axis=0, return_index=True, return_counts=True)
-    cameras = jax.tree.map(np.asarray, scene.cameras)
-    cameras = take(cameras, np.full(len(poses), first[counts.argmax()]))
-    return cameras.replace(world_from_cam=np.asarray(poses, np.float32))
 
 
 # --- the choice ---

@@ -34,7 +34,16 @@ from experiments.runtime import ReportError
 from experiments.schema import check_config
 
 # Options that runs must share, or their numbers cannot be compared.
-ALIKE = ("loader", "scene", "image_size", "load.", "rays_per_pixel", "field_kind", "sampler_kind")
+ALIKE = (
+    "loader",
+    "scene",
+    "image_size",
+    "load.",
+    "pool.",
+    "rays_per_pixel",
+    "field_kind",
+    "sampler_kind",
+)
 ALIKE += ("hash_grid.", "nerf_mlp.", "mip_mlp.", "march.", "proposal.", "train.")
 
 FLAGS = flags.FLAGS

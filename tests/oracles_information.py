@@ -65,3 +65,26 @@ def directional_gain(prior, vertices, looks, look, sharpness) -> float:
             known += ((1.0 + cosine) / 2.0) ** sharpness * old_h[np.all(vertices == vertex, 1)][0]
         total += sum(np.log((k + x) / k) for k, x in zip(known, h))
     return total
+
+
+def target_variance(prior, vertices, target, looks, sharpness) -> float:
+    """Predicted variance of a target's colours, a matrix of every vertex written out.
+
+    Args:
+      prior: [3] > 0, `1 / std^2`.
+      vertices: [G, 3].
+      target: (T [G, 3], position [3]); T and h are divided by the noise's variance.
+      looks: (h [G, 3], position [3]) of what is known.
+      sharpness: of the kernel `((1 + cos angle) / 2)^sharpness`.
+    """
+    curvature, stand = (np.asarray(x, np.float64) for x in target)
+    total = 0.0
+    for row, vertex in enumerate(np.asarray(vertices, np.float64)):
+        precision = np.diag(np.asarray(prior, np.float64))
+        for h, place in looks:
+            a, b = stand - vertex, np.asarray(place, np.float64) - vertex
+            cosine = a @ b / np.sqrt((a @ a) * (b @ b))
+            kernel = ((1.0 + cosine) / 2.0) ** sharpness
+            precision = precision + kernel * np.diag(np.asarray(h[row], np.float64))
+        total += np.trace(np.diag(curvature[row]) @ np.linalg.inv(precision))
+    return float(total)

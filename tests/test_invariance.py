@@ -182,7 +182,9 @@ def test_moving_turning_and_scaling_a_scene_changes_no_choice(name):
     np.testing.assert_allclose(scores, want_scores, rtol=2e-3, atol=2e-3)
 
 
-@pytest.mark.parametrize("name", ["bavs_topk", "d_optimal", "bavs_spread"])
+@pytest.mark.parametrize(
+    "name", ["bavs_topk", "d_optimal", "bavs_spread", "target_information_log", "surface_coverage"]
+)
 def test_the_size_of_an_unbounded_scene_changes_no_choice(name):
     want, want_scores = make_world("as it is", True).choose(POLICIES[name])
     got, scores = make_world("turned and smaller", True).choose(POLICIES[name])

@@ -6,8 +6,8 @@ import pytest
 
 from bavs_jax.selection.batch import acquire
 from bavs_jax.selection.context import make_context
+from bavs_jax.selection.distances import uniform_ranks
 from bavs_jax.selection.policies import POLICIES
-from bavs_jax.selection.policies.baselines import uniform_ranks
 from bavs_jax.selection.policies.distance import great_circle
 from tests import oracles_selection as oracles
 

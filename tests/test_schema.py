@@ -52,6 +52,7 @@ NONE_IS_FINE = {
     *("data_dir", "load.downscale", "load.pool_size", "load.test_every", "load.split"),
     *("view_seed", "sampler_kind", "train.learning_rate", "uncertainty.prior_weight"),
     *("candidates.mode", "candidates.min_train_distance", "candidates.min_candidate_distance"),
+    "targets.poses_file",
 }
 
 
@@ -122,7 +123,7 @@ def test_where_nothing_is_given_the_default_is_none():
     assert {option for option, value in values.items() if value is None} == NONE_IS_FINE
     for option in NONE_IS_FINE:
         config = base.get_config()
-        for old in OLD_VALUES[option]:
+        for old in OLD_VALUES.get(option, {}):
             assert leaves(check_config(with_value(option, old, config)))[option] is None
 
 
@@ -171,6 +172,9 @@ def test_an_option_that_is_a_group_or_missing_or_unknown_is_named():
         ("pool.degrees", 361.0, "is 361.0; give a number above 0 to 360"),
         ("pool.factor", 1.0, "is 1.0; give a number above 1 to 100"),
         ("pool.num_nearest", 2.0, "is 2.0; give a whole number from 1 to"),
+        ("targets.kind", "file", "targets.poses_file: goes with config.targets.kind='file'; give"),
+        ("targets.poses_file", "a.json", "goes with config.targets.kind='file'; give both or"),
+        ("targets.kind", "sphere", "is 'sphere'; give one of 'pool', 'hemisphere', 'file'"),
     ],
 )
 def test_messages_name_the_option_the_value_and_the_fix(option, value, message):

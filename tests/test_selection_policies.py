@@ -16,6 +16,7 @@ from bavs_jax.selection.information import Information, make_cached_curvature_fn
 from bavs_jax.selection.policies import POLICIES, get_policy
 from bavs_jax.selection.policies.distance import farthest_score
 from bavs_jax.selection.policy import MODES
+from bavs_jax.selection.targets import TargetInformation
 from tests import oracles_selection as oracles
 
 KEY = jax.random.key(0)
@@ -70,6 +71,33 @@ def directional_sources(view_ids, *, ties):
     return {"directional": DirectionalInformation((first,), look_fn, precision_fn)}
 
 
+def target_sources(view_ids, *, ties):
+    """The same of three targets, which are known from one look."""
+    known = directional_sources(view_ids, ties=ties)["directional"]
+    rng, vertices = (
+        np.random.default_rng(2),
+        np.random.default_rng(1).uniform(-1.0, 1.0, (NUM_VERTICES, 3)),
+    )
+    targets = [
+        Look(*sparse_curvature(rng.exponential(size=(NUM_VERTICES, 3))), place)
+        for place in 3.0 * rng.normal(size=(3, 3)).astype(np.float32)
+    ]
+
+    def target_fn(numbers):
+        return (targets[number] for number in numbers)
+
+    return {
+        "targets": TargetInformation(
+            looks=known.looks,
+            look_fn=known.look_fn,
+            target_fn=target_fn,
+            precision_fn=make_precision_fn(target_fn, vertices, prior=0.1),
+            num_values=np.array([30, 60, 90]),
+            vertices=vertices,
+        )
+    }
+
+
 def true_error_sources(view_ids, *, ties):
     """Stands in for photos of the candidates."""
     fn = curvature_sources(view_ids, ties=ties)["mean_uncertainty_fn"]
@@ -81,6 +109,7 @@ SOURCES = {
     "mean_uncertainty_fn": curvature_sources,
     "information": information_sources,
     "directional": directional_sources,
+    "targets": target_sources,
     "true_error_fn": true_error_sources,
 }
 
@@ -335,11 +364,16 @@ def test_spread_without_any_view_begins_in_the_middle():
 
 
 @pytest.mark.parametrize(
-    "name, first", [("bavs_spread", "spread"), ("farthest_informative", "farthest")]
+    "name, first, second",
+    [
+        ("bavs_spread", "spread", "directional"),
+        ("farthest_informative", "farthest", "directional"),
+        ("target_spread", "farthest", "target_information_log"),
+    ],
 )
-def test_products_of_two_scores(name, first):
+def test_products_of_two_scores(name, first, second):
     ctx = pool_context(POLICIES[name])
-    parts = [POLICIES[part].score_fn(KEY, ctx) for part in (first, "directional")]
+    parts = [POLICIES[part].score_fn(KEY, ctx) for part in (first, second)]
     expected = np.asarray(parts[0], np.float64) * parts[1]
     _, info = acquire(POLICIES[name], KEY, ctx, 1)
     np.testing.assert_allclose(info.scores[ctx.mask], expected[ctx.mask], rtol=1e-5)

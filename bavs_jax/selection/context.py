@@ -10,6 +10,7 @@ from bavs_jax.arrays import Array
 from bavs_jax.selection import SelectionError
 from bavs_jax.selection.directional import DirectionalInformation
 from bavs_jax.selection.information import Information
+from bavs_jax.selection.targets import TargetInformation
 
 
 class SourceFn(Protocol):
@@ -47,6 +48,8 @@ class Context(struct.PyTreeNode):
     information: Information | None = struct.field(pytree_node=False, default=None)
     # What views told about each side of the field (`directional.py`).
     directional: DirectionalInformation | None = struct.field(pytree_node=False, default=None)
+    # What views told about each side of the field, as far as targets show it (`targets.py`).
+    targets: TargetInformation | None = struct.field(pytree_node=False, default=None)
     # Mean squared errors of renders of candidates against their photos.
     true_error_fn: SourceFn | None = struct.field(pytree_node=False, default=None)
 
@@ -62,6 +65,7 @@ def make_context(
     mean_uncertainty_fn: MeanUncertaintyFn | None = None,
     information: Information | None = None,
     directional: DirectionalInformation | None = None,
+    targets: TargetInformation | None = None,
     true_error_fn: SourceFn | None = None,
 ) -> Context:
     """Checks and builds a `Context` with nothing picked yet, on the host.
@@ -73,7 +77,8 @@ def make_context(
       centre: [3] scene centre, scene units.
       view_ids: [C] distinct integers >= 0; default 0 .. C - 1.
       mask: [C] bool, which candidates may be picked; default all.
-      mean_uncertainty_fn, information, directional, true_error_fn: see `Context`.
+      mean_uncertainty_fn, information, directional, targets, true_error_fn: see
+        `Context`.
 
     Raises:
       SelectionError: on a wrong shape, a position that is not finite, or repeated view ids.
@@ -109,6 +114,7 @@ def make_context(
         mean_uncertainty_fn=mean_uncertainty_fn,
         information=information,
         directional=directional,
+        targets=targets,
         true_error_fn=true_error_fn,
     )
 
@@ -119,6 +125,8 @@ def require(ctx: Context, field: Literal["mean_uncertainty_fn"]) -> MeanUncertai
 def require(ctx: Context, field: Literal["information"]) -> Information: ...
 @overload
 def require(ctx: Context, field: Literal["directional"]) -> DirectionalInformation: ...
+@overload
+def require(ctx: Context, field: Literal["targets"]) -> TargetInformation: ...
 @overload
 def require(ctx: Context, field: Literal["true_error_fn"]) -> SourceFn: ...
 def require(ctx: Context, field: str):

@@ -14,7 +14,7 @@ grows, looks from different sides become independent.
 """
 
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +49,17 @@ class DirectionalInformation(NamedTuple):
     precision_fn: PrecisionFn
 
 
+def directions_to(points, position) -> jax.Array:
+    """Unit vectors [n, 3] from points [n, 3] to a position [3]; 0 for a point that lies there."""
+    away = position - points
+    return safe_divide(away, jnp.linalg.norm(away, axis=-1, keepdims=True))
+
+
+def direction_kernel(cosine, *, sharpness) -> jax.Array:
+    """`((1 + cos angle) / 2)^sharpness`, [...] in [0, 1]."""
+    return jnp.clip((1.0 + cosine) / 2.0, 0.0, 1.0) ** sharpness
+
+
 def same_side(points, camera, other, *, sharpness: float = SHARPNESS) -> jax.Array:
     """How far a look from `other` stands for one from `camera`: `((1 + cos angle) / 2)^sharpness`.
 
@@ -61,13 +72,8 @@ def same_side(points, camera, other, *, sharpness: float = SHARPNESS) -> jax.Arr
       [n] in [0, 1]; 1 in the same direction, and with a sharpness of 0 everywhere. A point on a
       camera has no direction to it, and counts as at a right angle.
     """
-
-    def towards(position):
-        away = position - points
-        return safe_divide(away, jnp.linalg.norm(away, axis=-1, keepdims=True))
-
-    half = (1.0 + (towards(camera) * towards(other)).sum(-1)) / 2.0
-    return jnp.clip(half, 0.0, 1.0) ** sharpness
+    cosine = (directions_to(points, camera) * directions_to(points, other)).sum(-1)
+    return direction_kernel(cosine, sharpness=sharpness)
 
 
 @jax.jit
@@ -85,7 +91,7 @@ def make_precision_fn(
     look_fn: LookFn,
     vertices,
     *,
-    prior: float,
+    prior: float | Array,
     sharpness: float = SHARPNESS,
     max_bytes: int = DEFAULT_MAX_BYTES,
 ) -> PrecisionFn:
@@ -97,7 +103,7 @@ def make_precision_fn(
     Args:
       look_fn: see `DirectionalInformation`.
       vertices: [G, 3] positions of the grid's vertices, scene units.
-      prior: 2 lambda > 0, the precision where nothing has looked.
+      prior: 2 lambda > 0, the precision where nothing has looked; one number, or [3] by axis.
       sharpness: see `same_side`.
       max_bytes: of remembered precisions.
     """
@@ -158,7 +164,22 @@ def directional_gains(information: DirectionalInformation, indices) -> np.ndarra
     return np.array([float(_gain(look.h, p)) for look, p in zip(looks, precisions)], np.float32)
 
 
-def add_look(information: DirectionalInformation, index: int) -> DirectionalInformation:
+class KnowsLooks(Protocol):
+    """A named tuple of what follows from looks, and of what candidates would see."""
+
+    @property
+    def looks(self) -> tuple[Look, ...]: ...
+
+    @property
+    def look_fn(self) -> LookFn: ...
+
+    def _replace(self, *, looks: tuple[Look, ...]) -> Self: ...
+
+
+AnyInformation = TypeVar("AnyInformation", bound=KnowsLooks)
+
+
+def add_look(information: AnyInformation, index: int) -> AnyInformation:
     """What is known once candidate `index` has been taken."""
     (look,) = information.look_fn([index])
     return information._replace(looks=(*information.looks, look))

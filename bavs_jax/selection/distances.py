@@ -4,12 +4,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from bavs_jax.arrays import Array
 
 SURVIVOR_SHARE = 0.17  # of the candidates, as in the paper's Table 4, which leaves 43 of 250
 SHARE_SHRINK, SHARE_MAX_SHRINKS = 0.95, 180  # radii of a share end at 1e-4 of where they began
 DEFAULT_SHRINK = 0.8
+GAP_SHRINK = 0.95  # of the least distance in `far_from_chosen`
 DEFAULT_MAX_SHRINKS = 32  # radii end at 0.8^32 < 1e-3 of where they began
 
 
@@ -170,6 +172,32 @@ def max_min_filter(
     return jnp.zeros_like(mask).at[visit].set(kept), info
 
 
+def far_from_chosen(
+    nearest, mask, num_wanted: int, *, shrink: float = GAP_SHRINK, max_shrinks: int = 256
+) -> np.ndarray:
+    """Candidates at least tau from all chosen views, [C] bool within `mask`.
+
+    Tau starts at the largest gap, the largest of the distances, and is multiplied by `shrink` until
+    as many as are wanted remain.
+
+    Args:
+      nearest: [C] distance of each candidate to the nearest chosen view; infinity where there is
+        none.
+      mask: [C] bool.
+      num_wanted: how many have to remain; all of `mask` do if it has no more, or if `max_shrinks`
+        are not enough.
+      shrink: in (0, 1).
+    """
+    nearest, mask = np.asarray(nearest, np.float64), np.asarray(mask)
+    tau = nearest[mask].max(initial=0.0)
+    for _ in range(max_shrinks):
+        far = mask & (nearest >= tau)
+        if far.sum() >= num_wanted:
+            return far
+        tau *= shrink
+    return mask
+
+
 def farthest_ranks(
     positions: jax.Array,
     training_positions: jax.Array,
@@ -208,3 +236,28 @@ def farthest_ranks(
     last = jnp.minimum(num_picks, mask.sum())
     ranks, _ = jax.lax.fori_loop(0, last, pick, (never, start))
     return never.at[by_id].set(ranks)
+
+
+def uniform_ranks(positions, view_ids):
+    """Place [C] of each camera in the farthest-point order of all of them, 0 .. C - 1.
+
+    The order begins with the camera nearest to their mean position, the middle of a front-facing
+    capture, and goes on with the one farthest from all before it; ties go to the smallest view id.
+
+    Args:
+      positions: [C, 3] scene units.
+      view_ids: [C] int, distinct.
+    """
+    by_id = jnp.argsort(view_ids)  # also the order of summing, so that no other order matters
+    points = positions[by_id]
+    first = jnp.argmin(pairwise_distances(points, points.mean(axis=0)[None])[:, 0])
+    later = farthest_ranks(
+        points,
+        points[first][None],
+        jnp.ones(1, bool),
+        jnp.arange(len(points)) != first,
+        len(points) - 1,
+        view_ids=view_ids[by_id],
+    )
+    ranks = (later + 1).at[first].set(0)
+    return jnp.zeros_like(ranks).at[by_id].set(ranks)

@@ -189,23 +189,42 @@ def direction_novelty(
     Numerics: computed as `min_c |d - d_c|^2 / 4`, exact for near directions.
     """
 
-    def add_camera(novelty, source):
-        camera, is_used, depth_map = source
+    def apart_from(camera, depth_map):
+        is_seen, _ = look_at_points(camera, points, depth_map, tolerance=tolerance)
+        difference = directions - directions_from(camera, points)
+        return jnp.where(is_seen, 0.25 * (difference * difference).sum(-1), 1.0)
 
-        def look(novelty):
-            is_seen, _ = look_at_points(camera, points, depth_map, tolerance=tolerance)
-            towards = points - camera.positions
-            seen_from = safe_divide(towards, jnp.linalg.norm(towards, axis=-1, keepdims=True))
-            difference = directions - seen_from
-            apart = 0.25 * (difference * difference).sum(-1)
-            return jnp.where(is_seen, jnp.minimum(novelty, apart), novelty)
-
-        return jax.lax.cond(is_used, look, lambda novelty: novelty, novelty), None
-
-    # One camera after the other: memory does not grow with V.
     never_seen = jnp.ones(points.shape[:-1], points.dtype)
-    novelty, _ = jax.lax.scan(add_camera, never_seen, (cameras, mask, depth_maps))
-    return novelty
+    return least_over_cameras(apart_from, never_seen, mask, (cameras, depth_maps))
+
+
+def directions_from(camera: Cameras, points: Array) -> jax.Array:
+    """Unit directions [..., 3] from one camera to points [..., 3]; 0 for a point on it."""
+    towards = points - camera.positions
+    return safe_divide(towards, jnp.linalg.norm(towards, axis=-1, keepdims=True))
+
+
+def least_over_cameras(
+    value_fn: Callable[..., jax.Array], start: jax.Array, mask: Array, sources: tuple
+) -> jax.Array:
+    """The least of `start` [K] and of the values [K] for each marked camera.
+
+    One camera after the other: memory does not grow with V, and those not marked cost nothing.
+
+    Args:
+      value_fn: values [K] from one camera's part of the sources.
+      start: [K].
+      mask: [V] bool, which cameras count.
+      sources: arrays [V, ...], `Cameras` among them, or None.
+    """
+
+    def add_camera(least, source):
+        is_used, parts = source
+        return jax.lax.cond(
+            is_used, lambda x: jnp.minimum(x, value_fn(*parts)), lambda x: x, least
+        ), None
+
+    return jax.lax.scan(add_camera, start, (mask, sources))[0]
 
 
 # From a state of training and view ids [n], the mean squared errors [n] of renders of these views.

@@ -182,4 +182,11 @@ def get_config() -> ConfigDict:
     config.candidates.min_train_distance = placeholder(float)
     config.candidates.min_candidate_distance = placeholder(float)
 
+    # --- what policies by target information ask about (bavs_jax/selection/targets.py) ---
+    config.targets = ConfigDict()
+    config.targets.kind = "pool"  # "pool": the candidates; "hemisphere" (Eq 14); "file"
+    config.targets.num = 32  # most target views, evenly spaced among those there are
+    # Of kind "file": poses in your own coordinates, such as the transforms.json of suggest_views.
+    config.targets.poses_file = placeholder(str)
+
     return config

@@ -1,10 +1,9 @@
 """What every other policy has to beat, and a reference that looks at the answers."""
 
 import jax
-import jax.numpy as jnp
 
 from bavs_jax.selection.context import require, score_candidates
-from bavs_jax.selection.distances import farthest_ranks, pairwise_distances
+from bavs_jax.selection.distances import uniform_ranks
 from bavs_jax.selection.policy import Policy
 
 
@@ -15,31 +14,6 @@ def random_score(key, ctx):
         return jax.random.uniform(jax.random.fold_in(key, view_id))
 
     return jax.vmap(draw)(ctx.view_ids)
-
-
-def uniform_ranks(positions, view_ids):
-    """Place [C] of each camera in the farthest-point order of all of them, 0 .. C - 1.
-
-    The order begins with the camera nearest to their mean position, the middle of a front-facing
-    capture, and goes on with the one farthest from all before it; ties go to the smallest view id.
-
-    Args:
-      positions: [C, 3] scene units.
-      view_ids: [C] int, distinct.
-    """
-    by_id = jnp.argsort(view_ids)  # also the order of summing, so that no other order matters
-    points = positions[by_id]
-    first = jnp.argmin(pairwise_distances(points, points.mean(axis=0)[None])[:, 0])
-    later = farthest_ranks(
-        points,
-        points[first][None],
-        jnp.ones(1, bool),
-        jnp.arange(len(points)) != first,
-        len(points) - 1,
-        view_ids=view_ids[by_id],
-    )
-    ranks = (later + 1).at[first].set(0)
-    return jnp.zeros_like(ranks).at[by_id].set(ranks)
 
 
 _ranks_fn = jax.jit(uniform_ranks)  # compiled once per number of candidates

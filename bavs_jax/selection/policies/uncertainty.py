@@ -1,7 +1,15 @@
 """Policies by the mean of a rendered image of uncertainty: the paper's own, and its rivals."""
 
+import math
+
+import numpy as np
+
 from bavs_jax.selection.context import require, score_candidates
+from bavs_jax.selection.distances import far_from_chosen
+from bavs_jax.selection.policies.distance import nearest_chosen
 from bavs_jax.selection.policy import Policy
+
+FAR_SHARE = 0.25  # of the candidates, those among which `surface_coverage` chooses
 
 
 def mean_score(key, ctx):
@@ -9,6 +17,20 @@ def mean_score(key, ctx):
     del key
     mean_uncertainty = require(ctx, "mean_uncertainty_fn")
     return score_candidates(ctx, lambda indices: mean_uncertainty(indices, ctx.picked))
+
+
+def far_mean_score(key, ctx):
+    """`mean_score`, in [0, 1], among the candidates that are farthest from all chosen views.
+
+    They are those that `far_from_chosen` leaves of a quarter of all. The others are not looked at
+    and score -1, below any view of nothing.
+    """
+    mask = np.asarray(ctx.mask)
+    far = far_from_chosen(nearest_chosen(ctx), mask, math.ceil(FAR_SHARE * mask.sum()))
+    scores = np.full(len(mask), np.nan, np.float32)
+    scores[mask] = -1.0
+    scores[far] = mean_score(key, ctx.replace(mask=far))[far]
+    return scores
 
 
 BY_IMAGE = Policy(
@@ -62,6 +84,16 @@ POLICIES = (
         name="coverage",
         summary="Greedily the view that sees most surface from directions that are new.",
         uncertainty="coverage",
+        update_fn=lambda ctx, index: ctx,  # the model is conditioned on `ctx.picked`
+        mode="greedy",
+    ),
+    # After SBV, CONVERGE and AGILE.
+    BY_IMAGE._replace(
+        name="surface_coverage",
+        summary="Greedily, of the views far from all chosen ones, that of most surface from new "
+        "directions and most unseen space.",
+        score_fn=far_mean_score,
+        uncertainty="surface_coverage",
         update_fn=lambda ctx, index: ctx,  # the model is conditioned on `ctx.picked`
         mode="greedy",
     ),

@@ -1,0 +1,58 @@
+"""Policies by what a view would tell about declared target views, not about parameters."""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from bavs_jax.selection.context import require, score_candidates
+from bavs_jax.selection.directional import add_look
+from bavs_jax.selection.policies.distance import nearest_chosen
+from bavs_jax.selection.policy import Policy
+from bavs_jax.selection.targets import TargetInformation, linear_gain, log_gain
+
+TargetGain = Callable[[TargetInformation, np.ndarray], np.ndarray]
+
+
+def target_score(key, ctx, *, gain: TargetGain = log_gain):
+    """What each candidate would tell about the targets (`selection/targets.py`).
+
+    Ours. I-optimal design and the expected predictive information gain on the paper's deformation
+    grid, in which a look counts for a target as far as it came from the same side.
+    """
+    del key
+    return score_candidates(ctx, partial(gain, require(ctx, "targets")))
+
+
+def target_spread_score(key, ctx):
+    """Distance to the nearest chosen view times `target_information_log`.
+
+    Ours. From few views the curvature is that of fog. Distance needs no field and leads then, as in
+    `farthest_informative`.
+    """
+    return np.asarray(nearest_chosen(ctx)) * target_score(key, ctx)
+
+
+TARGET_INFORMATION = Policy(
+    name="target_information",
+    summary="Greedily the view that lowers the predicted colour variance of target views most.",
+    score_fn=partial(target_score, gain=linear_gain),
+    update_fn=lambda ctx, index: ctx.replace(targets=add_look(require(ctx, "targets"), index)),
+    needs=frozenset({"targets"}),
+    mode="greedy",
+)
+
+POLICIES = (
+    TARGET_INFORMATION,
+    TARGET_INFORMATION._replace(
+        name="target_information_log",
+        summary="Greedily the view of largest information about target views, view by view.",
+        score_fn=target_score,
+    ),
+    TARGET_INFORMATION._replace(
+        name="target_spread",
+        summary="Greedily the view of largest distance to the chosen ones times information about "
+        "target views.",
+        score_fn=target_spread_score,
+    ),
+)
