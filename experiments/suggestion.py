@@ -303,7 +303,8 @@ def suggest(
     source_key, choose_key = jax.random.split(stream_key(options.seed, "choice"))
     acquired = run.acquired._replace(candidates=cameras)
     fields = {"mean_uncertainty_fn": lambda rows, picked: scores[rows], "information": information}
-    if policy.uncertainty != "laplace" or not policy.needs <= fields.keys():
+    is_known = (policy.uncertainty, policy.measure) == ("laplace", "uncertainty")
+    if not is_known or not policy.needs <= fields.keys():
         everyone = Candidates(cameras, np.arange(len(cameras)), np.ones(len(cameras), bool))
         fields |= problem.inputs(policy, source_key, acquired, everyone).fields
     context = make_context(
