@@ -88,6 +88,7 @@ class InputMaker:
         self.setup, self.model_fns, self.options = setup, model_fns, options
         self.track, self.true_error_fn = track, true_error_fn
         self.make_targets = make_targets
+        self._kept: dict[str, tuple[Any, Any, Any]] = {}
 
     def __call__(
         self, policy: Policy, key, acquired: Acquired, candidates: Candidates
@@ -109,10 +110,21 @@ class InputMaker:
         }
         return PolicyInputs(fields, seconds)
 
+    def _once(self, name: str, acquired: Acquired, make: Callable[[], Any]):
+        """What depends on field and photos alone; asked again with other candidates, it is kept."""
+        train, views, made = self._kept.get(name, (None, None, None))
+        if train is not acquired.train or views is not acquired.is_training_view:
+            made = make()
+            self._kept[name] = acquired.train, acquired.is_training_view, made
+        return made
+
     def _mean_uncertainty(self, policy, key, acquired, candidates, seconds):
         fns, options = self.model_fns(policy.uncertainty), self.options
         with _clock(seconds, "fit" if policy.uncertainty != "laplace" else "curvature"):
-            fitted = fns.fit(key, acquired)
+            if fns.condition is None:
+                fitted = self._once(policy.uncertainty, acquired, partial(fns.fit, key, acquired))
+            else:  # it knows the candidates
+                fitted = fns.fit(key, acquired)
 
         def mean_fn(indices, picked):
             with _clock(seconds, "score"):
@@ -135,7 +147,11 @@ class InputMaker:
 
     def _information(self, policy, key, acquired, candidates, seconds):
         with _clock(seconds, "curvature"):
-            jac_sq_sum = training_curvature(key, self.setup, acquired, WEIGHTING)
+            jac_sq_sum = self._once(
+                "curvature",
+                acquired,
+                partial(training_curvature, key, self.setup, acquired, WEIGHTING),
+            )
             precision = posterior_precision(
                 jac_sq_sum,
                 num_rays=acquired.num_rays,
