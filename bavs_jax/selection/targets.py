@@ -48,6 +48,7 @@ from bavs_jax.selection.directional import (
 )
 
 TARGETS_AT_ONCE = 32  # whose curvature is held while candidates go by
+TARGETS_SIDE_BY_SIDE = 8  # of these, in one compiled call
 
 
 class TargetInformation(NamedTuple):
@@ -69,21 +70,44 @@ class TargetVariances(NamedTuple):
     drops: np.ndarray  # [n, N] float64, D_tc
 
 
-class _Target(NamedTuple):
-    """One target as the inner loop reads it: by components, which a CPU does four at a time."""
+class _Targets(NamedTuple):
+    """Some targets as the inner loop reads them: by components, which a CPU does several at once.
 
-    rows: Array  # [m] int32
-    points: jax.Array  # [3, m] the vertices at these rows
-    directions: jax.Array  # [3, m] from there to the target's camera
-    curvature: jax.Array  # [3, m] T / noise^2
-    precision: jax.Array  # [3, m] P
+    Padded to the m rows of the longest with rows of no curvature.
+    """
+
+    rows: Array  # [t, m] int32
+    points: jax.Array  # [3, t, m] the vertices at these rows
+    directions: jax.Array  # [3, t, m] from there to the target's camera
+    curvature: jax.Array  # [3, t, m] T / noise^2
+    precision: jax.Array  # [3, t, m] P
 
 
 @jax.jit
-def _prepare(look: Look, precision, vertices) -> _Target:
-    points = vertices[look.rows]
-    directions = directions_to(points, look.position)
-    return _Target(look.rows, points.T, directions.T, jnp.asarray(look.h).T, precision.T)
+def _by_components(rows, curvature, precision, positions, vertices) -> _Targets:
+    points = vertices[rows]
+    directions = jax.vmap(directions_to)(points, positions)
+    parts = (points, directions, curvature, precision)
+    return _Targets(rows, *(jnp.moveaxis(x, -1, 0) for x in parts))
+
+
+def _side_by_side(looks: list[Look], precisions: list, vertices) -> _Targets:
+    most = max(len(look.rows) for look in looks)
+
+    def stacked(parts, fill):
+        padded = []
+        for part in map(np.asarray, parts):
+            widths = [(0, most - len(part))] + [(0, 0)] * (part.ndim - 1)
+            padded.append(np.pad(part, widths, constant_values=fill))
+        return np.stack(padded)
+
+    return _by_components(
+        stacked([look.rows for look in looks], 0),
+        stacked([look.h for look in looks], 0.0),
+        stacked(precisions, 1.0),
+        np.stack([look.position for look in looks]),
+        vertices,
+    )
 
 
 @jax.jit
@@ -92,25 +116,25 @@ def _dense(rows, h, vertices):
 
 
 @partial(jax.jit, static_argnames="sharpness")
-def variance_drop(target: _Target, dense, position, *, sharpness) -> jax.Array:
-    """The terms [m] of one `D_tc`, summed over axes alone; the host adds up the rest pairwise.
+def _drop_terms(targets: _Targets, dense, position, *, sharpness) -> jax.Array:
+    """The terms [t, m] of `D_tc`, summed over axes alone: a CPU adds long sums up one by one.
 
     Args:
-      target: what is asked about.
+      targets: what is asked about.
       dense: [3, G] what the candidate's look brings, divided by noise^2.
       position: [3] where the candidate stands, scene units.
       sharpness: of the kernel; whole numbers are much faster.
     """
-    away = [position[i] - target.points[i] for i in range(3)]
-    along = sum(a * b for a, b in zip(away, target.directions))
+    away = [position[i] - targets.points[i] for i in range(3)]
+    along = sum(a * b for a, b in zip(away, targets.directions))
     distance = jnp.sqrt(sum(a * a for a in away))
     weight = direction_kernel(safe_divide(along, distance), sharpness=sharpness)
     terms = jnp.zeros_like(distance)
     for axis in range(3):
-        added = weight * dense[axis][target.rows]
-        before = target.precision[axis]
+        added = weight * dense[axis][targets.rows]
+        before = targets.precision[axis]
         # No difference of near numbers.
-        terms += target.curvature[axis] * added / (before * (before + added))
+        terms += targets.curvature[axis] * added / (before * (before + added))
     return terms
 
 
@@ -129,20 +153,28 @@ def target_variances(information: TargetInformation, indices) -> TargetVariances
     sharpness = float(information.sharpness)
     power = int(sharpness) if sharpness.is_integer() else sharpness
     variances, drops = np.zeros(num), np.zeros((len(indices), num))
-    for start in range(0, num, TARGETS_AT_ONCE):
-        group = np.arange(start, min(start + TARGETS_AT_ONCE, num))
-        looks = information.target_fn(group)
-        precisions = information.precision_fn(information.looks, group)
-        targets = [_prepare(look, p, vertices) for look, p in zip(looks, precisions)]
-        for number, target in zip(group, targets):
-            terms = np.asarray(target.curvature) / np.asarray(target.precision)
-            variances[number] = terms.sum(dtype=np.float64)
+    for held in _parts(np.arange(num), TARGETS_AT_ONCE):
+        looks = list(information.target_fn(held))
+        precisions = list(information.precision_fn(information.looks, held))
+        for number, look, precision in zip(held, looks, precisions):
+            variances[number] = (look.h / np.asarray(precision)).sum(dtype=np.float64)
+        groups = [
+            (
+                held[part],
+                _side_by_side([looks[i] for i in part], [precisions[i] for i in part], vertices),
+            )
+            for part in _parts(np.arange(len(held)), TARGETS_SIDE_BY_SIDE)
+        ]
         for place, look in enumerate(information.look_fn(indices)):
-            dense, position = _dense(look.rows, look.h, vertices), look.position
-            for number, target in zip(group, targets):
-                terms = variance_drop(target, dense, position, sharpness=power)
-                drops[place, number] = np.asarray(terms).sum(dtype=np.float64)
+            dense = _dense(look.rows, look.h, vertices)
+            for numbers, targets in groups:
+                terms = _drop_terms(targets, dense, look.position, sharpness=power)
+                drops[place, numbers] = np.asarray(terms).sum(-1, dtype=np.float64)
     return TargetVariances(variances, drops)
+
+
+def _parts(numbers: np.ndarray, size: int) -> list[np.ndarray]:
+    return [numbers[start : start + size] for start in range(0, len(numbers), size)]
 
 
 def linear_gain(information: TargetInformation, indices) -> np.ndarray:
