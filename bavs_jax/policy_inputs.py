@@ -163,38 +163,44 @@ class InputMaker:
     def _directional(self, policy, key, acquired, candidates, seconds):
         curvature_fn = self._candidate_curvature(acquired, candidates, seconds)
         with _clock(seconds, "curvature"):
+            looks = self._training_looks(acquired)
             return directional_information(
                 self.setup,
-                acquired,
+                looks,
                 candidates.cameras,
                 curvature_fn,
-                image_scale=self.options.image_scale,
                 max_bytes=self.options.cache_bytes,
             )
 
     def _targets(self, policy, key, acquired, candidates, seconds):
-        options, cameras = self.options, candidates.cameras
+        options = self.options
         look_fn = target_fn = make_look_fn(
-            cameras, self._candidate_curvature(acquired, candidates, seconds)
+            candidates.cameras, self._candidate_curvature(acquired, candidates, seconds)
         )
-        given, view_ids = self.make_targets(key), candidates.view_ids
-        if given is not None:
-            cameras, view_ids = given, None
+        cameras, view_ids = self.make_targets(key), None
+        if cameras is None:
+            cameras = candidates.cameras if acquired.candidates is None else acquired.candidates
+            view_ids = candidates.view_ids[: len(cameras)]
+        if cameras is not candidates.cameras:
             curvature_fn = self._candidate_curvature(
-                acquired, candidates._replace(cameras=given), seconds
+                acquired, candidates._replace(cameras=cameras), seconds
             )
-            target_fn = make_look_fn(given, curvature_fn)
+            target_fn = make_look_fn(cameras, curvature_fn)
         rows = evenly_spaced_cameras(cameras.positions, options.num_targets, view_ids=view_ids)
         with _clock(seconds, "curvature"):
             return target_information(
                 self.setup,
                 acquired.num_rays,
-                training_looks(self.setup, acquired, options.image_scale),
+                self._training_looks(acquired),
                 look_fn,
                 lambda numbers: target_fn(rows[numbers]),
                 take(cameras, rows),
                 max_bytes=options.cache_bytes,
             )
+
+    def _training_looks(self, acquired):
+        make = partial(training_looks, self.setup, acquired, self.options.image_scale)
+        return self._once("looks", acquired, make)
 
     def _true_error(self, true_error_fn, policy, key, acquired, candidates, seconds):
         return lambda indices: true_error_fn(acquired.train, candidates.view_ids[indices])
@@ -218,20 +224,19 @@ class InputMaker:
 
 def directional_information(
     setup: SceneSetup,
-    acquired: Acquired,
+    looks: tuple[Look, ...],
     cameras: Cameras,
     curvature_fn: CurvatureFn,
     *,
-    image_scale: float,
     max_bytes: int = DEFAULT_MAX_BYTES,
 ) -> DirectionalInformation:
     """What the training views have told about each side, and what C cameras would add.
 
     Args:
-      setup, acquired: the field and its training views.
+      setup: the scene's grid and prior.
+      looks: of the training views, at the candidates' image scale.
       cameras: the candidates.
       curvature_fn: theirs, as in `Information`.
-      image_scale: of the training views' width and height, as for candidates.
       max_bytes: of host memory for precisions that are kept from pick to pick.
     """
     look_fn = make_look_fn(cameras, curvature_fn)
@@ -241,9 +246,7 @@ def directional_information(
         prior=prior_precision(setup.laplace.prior_weight),
         max_bytes=max_bytes,
     )
-    return DirectionalInformation(
-        training_looks(setup, acquired, image_scale), look_fn, precision_fn
-    )
+    return DirectionalInformation(looks, look_fn, precision_fn)
 
 
 def make_look_fn(cameras: Cameras, curvature_fn: CurvatureFn) -> LookFn:

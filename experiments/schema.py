@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 from absl import flags
 from ml_collections import ConfigDict
 
@@ -27,6 +28,7 @@ from experiments.files import leaves, modern_value
 from experiments.runtime import ConfigError, one_line, shown
 
 MAX_SEED = 2**32 - 1  # a larger one is the key of another seed, or none
+MAX_LENGTH = 1e9  # of places, user units
 MAX_WIDTH = 8192  # pixels of an image
 MAX_COUNT = 10**9
 MAX_VALUE = 1e9  # of a number without a natural bound; above it float32 loses what is added
@@ -298,3 +300,21 @@ def check_options(config: ConfigDict, schema: dict[str, Option], name: str) -> d
         if not fits(value):
             raise ConfigError(f"{name}.{option}: is {shown(value)}; give {wanted}")
     return values
+
+
+def parse_numbers(text: str, shape: tuple[int, ...], flag: str) -> np.ndarray | None:
+    """Numbers with commas between them; None for an empty text.
+
+    Raises:
+      ConfigError: another count of numbers, or one that cannot be used.
+    """
+    if not text.strip():
+        return None
+    try:
+        values = np.array([float(part) for part in text.split(",")])
+        if not (abs(values) <= MAX_LENGTH).all():
+            raise ValueError("too large, or not a number")
+        return values.reshape(shape)
+    except ValueError as error:
+        wanted = f"give {np.prod(shape)} numbers of at most 1e9 with commas"
+        raise ConfigError(f"--{flag}: {shown(text)} cannot be used ({error}): {wanted}") from None

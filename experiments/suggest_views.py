@@ -21,7 +21,7 @@ from experiments import runtime, suggestion
 from experiments.build import Problem
 from experiments.files import check_claim, claim
 from experiments.reporting.suggestion import write_results
-from experiments.schema import MAX_SEED, MAX_WIDTH, check_config
+from experiments.schema import MAX_SEED, MAX_WIDTH, check_config, parse_numbers
 from experiments.suggestion import Options
 from experiments.trained import FIRST_ROUND, train_run
 
@@ -54,6 +54,8 @@ flags.DEFINE_float("clearance", 0.0, "Free radius around a camera in user units;
 flags.DEFINE_float("spread", 0.25, "Share by which the shell goes beyond the photos.", LEAST, 1000)
 flags.DEFINE_float("gaze_jitter", 8.0, "Degrees by which shell and box poses look aside.", 0, 90)
 flags.DEFINE_float("score_scale", 0.25, "Size of the images that are scored, a share.", LEAST, 1)
+REFINE = "Steps by which each chosen pose is moved and turned to where it tells more; 0: none."
+flags.DEFINE_integer("refine", 0, REFINE, 0, 1000)
 flags.DEFINE_bool("route", False, "Order the poses along a short route.")
 flags.DEFINE_string("start", "", "x,y,z where the route begins; default: at the last photo.")
 
@@ -61,8 +63,8 @@ flags.DEFINE_string("start", "", "x,y,z where the route begins; default: at the 
 def read_options() -> Options:
     """The flags as options, checked; errors as in `check_options`."""
     given = {name: FLAGS[name].value for name in Options._fields}
-    given["bounds"] = suggestion.parse_numbers(FLAGS.bounds, (2, 3), "bounds")
-    given["start"] = suggestion.parse_numbers(FLAGS.start, (3,), "start")
+    given["bounds"] = parse_numbers(FLAGS.bounds, (2, 3), "bounds")
+    given["start"] = parse_numbers(FLAGS.start, (3,), "start")
     options = Options(**given)
     suggestion.check_options(options)
     return options

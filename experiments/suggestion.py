@@ -13,6 +13,7 @@ import numpy as np
 
 from bavs_jax.cameras import Cameras, hemisphere_poses, num_pixels, reduced_cameras, take
 from bavs_jax.candidates import Candidates, candidate_cameras
+from bavs_jax.placement.ascent import Ascent, ascend, policy_scores
 from bavs_jax.placement.clearance import judge_positions, matter_density, within_bounds
 from bavs_jax.placement.collect import PlacementError, Proposals, check_enough, collect_poses
 from bavs_jax.placement.proposals import aim, box_positions, shell_positions, turned_targets
@@ -42,13 +43,15 @@ from experiments.build_model import RENDER_CHUNK
 from experiments.configs import capture
 from experiments.evaluate import evenly_spaced
 from experiments.files import read_arrays, write_arrays
-from experiments.runtime import shown, track
+from experiments.runtime import track
 from experiments.trained import TrainedRun
 
 KINDS = ("shell", "hemisphere", "box", "file")
-MAX_LENGTH = 1e9  # user units
 CLEARANCE_SHARE = 0.05  # of the median distance of the photos from what they look at
 SOLID_SHARE = 0.05  # the same, over which solid matter takes away half of the light
+CONDITIONED = ("coverage", "surface_coverage")  # models that were made for given candidates
+REFINE_SHARE = 0.15  # of that distance: as far as a chosen pose may move, along each axis
+REFINE_DEGREES = 15.0  # by which its gaze may turn, up or down and aside
 OPPOSITE = 1e-3  # length of the mean of two directions below which it has none of its own
 NUM_AT_ONCE = 8  # candidates between two steps of the progress bar
 NUM_COMPARED = 8  # photos whose repetition is what new views are compared with
@@ -79,6 +82,7 @@ class Options(NamedTuple):
     gaze_jitter: float  # degrees
     route: bool
     start: np.ndarray | None  # [3] where the route begins; None: at the last photo
+    refine: int  # steps by which each chosen pose is made better; 0: none
     seed: int
 
 
@@ -99,6 +103,8 @@ def check_options(options: Options) -> None:
         raise PlacementError("--bounds: is missing: --candidates=box needs x0,y0,z0,x1,y1,z1")
     if (o.candidates == "file") != bool(o.poses_file):
         raise PlacementError("--poses_file: goes with --candidates=file: give both or neither")
+    if o.refine and o.poses_file:
+        raise PlacementError("--refine: poses of a file stay where they are: leave it out")
     if o.start is not None and not o.route:
         raise PlacementError("--start: is only of use with --route: give both or neither")
     if o.poses_file:
@@ -108,29 +114,13 @@ def check_options(options: Options) -> None:
         reason = "needs the candidates' photos, which do not exist yet"
     elif policy.field_kind != RECONSTRUCTION:
         reason = f"needs a field of kind {policy.field_kind!r}"
+    elif o.refine and (policy.update_fn is None and not policy.needs):
+        reason = "has no score that a pose could be moved by (--refine)"
+    elif o.refine and policy.uncertainty in CONDITIONED:
+        reason = "knows its candidates alone, so that none can be moved (--refine)"
     else:
         return
     raise SelectionError(f"--policy: {o.policy!r} {reason}; use another policy, such as bavs")
-
-
-def parse_numbers(text: str, shape: tuple[int, ...], flag: str) -> np.ndarray | None:
-    """Numbers with commas between them; None for an empty text.
-
-    Raises:
-      PlacementError: another count of numbers, or one that cannot be used.
-    """
-    if not text.strip():
-        return None
-    try:
-        values = np.array([float(part) for part in text.split(",")])
-        if not (abs(values) <= MAX_LENGTH).all():
-            raise ValueError("too large, or not a number")
-        return values.reshape(shape)
-    except ValueError as error:
-        wanted = f"give {np.prod(shape)} numbers of at most 1e9 with commas"
-        raise PlacementError(
-            f"--{flag}: {shown(text)} cannot be used ({error}): {wanted}"
-        ) from None
 
 
 # --- the field ---
@@ -212,6 +202,18 @@ def propose(
     Raises:
       PlacementError: fewer than `options.num_views` are left.
     """
+    judge = make_judge(scene, density_fn, around, options)
+    draw = partial(draw_poses, scene, around, options)
+    wanted = options.num_candidates
+    if options.candidates == "file":
+        wanted = max(wanted, len(draw(0)))
+    proposals = collect_poses(draw, judge, wanted)
+    check_enough(proposals, options.num_views, fixes=FIXES)
+    return proposals
+
+
+def make_judge(scene: Scene, density_fn: Callable, around: Surroundings, options: Options):
+    """From poses [N, 3, 4] to why a camera may not stand there [N]: of `REASONS`, or -1."""
     photos = take(scene.cameras, scene.pool)
 
     def judge(poses):
@@ -228,13 +230,7 @@ def propose(
             reason[left[unseen]] = 3
         return reason
 
-    draw = partial(draw_poses, scene, around, options)
-    wanted = options.num_candidates
-    if options.candidates == "file":
-        wanted = max(wanted, len(draw(0)))
-    proposals = collect_poses(draw, judge, wanted)
-    check_enough(proposals, options.num_views, fixes=FIXES)
-    return proposals
+    return judge
 
 
 def draw_poses(scene: Scene, around: Surroundings, options: Options, lap: int) -> np.ndarray:
@@ -282,6 +278,7 @@ class Suggestion(NamedTuple):
     info: SelectionInfo
     worth: Worth  # of what each pick tells, and the best one left would tell, nats
     photo_gain: float  # what one more photo from where there is one would tell, nats
+    ascent: Ascent | None = None  # how the chosen ones were moved, if they were
 
 
 def suggest(
@@ -307,14 +304,43 @@ def suggest(
     if not is_known or not policy.needs <= fields.keys():
         everyone = Candidates(cameras, np.arange(len(cameras)), np.ones(len(cameras), bool))
         fields |= problem.inputs(policy, source_key, acquired, everyone).fields
-    context = make_context(
-        cameras.positions,
-        training_positions=np.asarray(problem.table.cameras.positions),
-        is_training_view=acquired.is_training_view,
-        centre=around.focus,
-        **fields,
-    )
+    about = {
+        "training_positions": np.asarray(problem.table.cameras.positions),
+        "is_training_view": acquired.is_training_view,
+        "centre": around.focus,
+    }
+    context = make_context(cameras.positions, **about, **fields)
     selected, info = acquire(policy, choose_key, context, options.num_views)
+    ascent = None
+    if options.refine:
+
+        def context_fn(every: Cameras, mask):
+            found = Candidates(every, np.arange(len(every)), mask)
+            inputs = problem.inputs(policy, source_key, acquired, found).fields
+            return make_context(
+                every.positions, mask=mask, places=cameras.positions, **about, **inputs
+            )
+
+        density_fn = partial(problem.density, run.state.train)
+        judge = make_judge(problem.scene, density_fn, around, options)
+        with track(options.refine * len(selected), "move the chosen poses", "steps") as bar:
+            ascent = ascend(
+                proposals.poses[selected],
+                policy_scores(policy, choose_key, cameras, context_fn),
+                lambda trials: judge(trials) < 0,
+                up=problem.scene.up,
+                length=REFINE_SHARE * around.distance,
+                angle=np.radians(REFINE_DEGREES),
+                steps=options.refine,
+                progress_fn=bar.advance,
+            )
+        poses = np.array(cameras.world_from_cam)
+        poses[selected] = ascent.poses
+        cameras = cameras.replace(world_from_cam=poses)
+        small = reduced_cameras(take(cameras, selected), problem.setup.image_scale)
+        scores[selected] = mean_uncertainty(render, small, chunk=RENDER_CHUNK)
+        information = photo_information(run, jac_sq_sum, cameras)
+        gains[selected] = candidate_gains(information, selected, gain=log_det_gain)
 
     gains_of = partial(candidate_gains, gain=log_det_gain)
     worth = worth_along(information, selected, gains, add_fn=add_curvature, score_fn=gains_of)
@@ -322,7 +348,7 @@ def suggest(
     again = photo_information(run, jac_sq_sum, photos)
     photo_gains = information_gains(again, len(photos), "what photos would tell again")
     gain = float(np.median(photo_gains))
-    return Suggestion(around, proposals, cameras, selected, scores, info, worth, gain)
+    return Suggestion(around, proposals, cameras, selected, scores, info, worth, gain, ascent)
 
 
 def photo_information(run: TrainedRun, jac_sq_sum, cameras: Cameras) -> Information:

@@ -21,6 +21,8 @@ from bavs_jax.selection.context import SelectionError
 from bavs_jax.selection.worth import Worth
 from experiments import suggestion
 from experiments.reporting.suggestion import worth_words, write_poses
+from experiments.runtime import ConfigError
+from experiments.schema import parse_numbers
 from tests.scene_files import orbit, write_nerfstudio
 from tests.toy_scenes import toy_scene
 
@@ -40,6 +42,7 @@ def options(**changes) -> suggestion.Options:
         gaze_jitter=5.0,
         route=False,
         start=None,
+        refine=0,
         seed=0,
     )
     return given._replace(**changes)
@@ -70,6 +73,7 @@ def ball(points):
         ({"start": np.zeros(3)}, "--start"),
         ({"bounds": np.array([[1, 2, 3], [0, 5, 6]])}, "--bounds: each of"),
         ({"candidates": "file", "poses_file": "/nowhere.csv"}, "/nowhere.csv"),
+        ({"candidates": "file", "poses_file": "a.csv", "refine": 2}, "--refine: poses of a file"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(changes, message):
@@ -80,11 +84,11 @@ def test_options_that_do_not_fit_are_refused(changes, message):
 
 @pytest.mark.parametrize("text", ["1,2", "1,2,3,4,5,x", "1,2,3,4,5,1e10", "1,2,3,4,5,nan"])
 def test_numbers_that_are_no_box_are_refused(text):
-    with pytest.raises(PlacementError, match=r"--bounds: .*give 6 numbers"):
-        suggestion.parse_numbers(text, (2, 3), "bounds")
-    found = suggestion.parse_numbers("0,1,2, 3,4,5", (2, 3), "bounds")
+    with pytest.raises(ConfigError, match=r"--bounds: .*give 6 numbers"):
+        parse_numbers(text, (2, 3), "bounds")
+    found = parse_numbers("0,1,2, 3,4,5", (2, 3), "bounds")
     np.testing.assert_array_equal(found, [[0, 1, 2], [3, 4, 5]])
-    assert suggestion.parse_numbers("", (2, 3), "bounds") is None
+    assert parse_numbers("", (2, 3), "bounds") is None
 
 
 # --- candidates in the user's coordinates ---
@@ -278,6 +282,25 @@ def test_same_folder_uses_the_same_field_for_other_candidates_and_policies(finis
     assert (places_ >= [-6, -6, 0.5]).all() and (places_ <= [6, 6, 5]).all()
 
 
+def test_refined_poses_tell_more_and_stay_within_bounds(finished):
+    base, flags, _ = finished
+    box = ["--candidates=box", "--bounds=-6,-6,0.5,6,6,5", "--holdout=2", "--policy=bavs_spread"]
+    frames = {}
+    for steps in (0, 2):
+        done = script(*flags, *box, f"--refine={steps}")
+        assert done.returncode == 0, done.stderr
+        found = json.loads((base / "out/next_views/transforms.json").read_text())["frames"]
+        frames[steps] = np.array([frame["transform_matrix"] for frame in found])
+    refined = json.loads((base / "out/suggestion.json").read_text())["refined"]
+    before, after = np.array(refined["before"]), np.array(refined["after"])
+    assert (after >= before * (1 - 1e-5)).all() and after.sum() > before.sum()
+    assert "raised their scores by" in (base / "out/report.html").read_text()
+    places_ = frames[2][:, :3, 3]
+    assert (places_ >= [-6, -6, 0.5]).all() and (places_ <= [6, 6, 5]).all()
+    apart = np.linalg.norm(places_ - frames[0][:, :3, 3], axis=-1)
+    assert 0 < apart.max() < 0.15 * np.sqrt(3) * 6.0  # of the photos' distance, on three axes
+
+
 @pytest.mark.parametrize("flag", ["--data=/nowhere", "--gaze_jitter=91", "--score_scale=0"])
 def test_a_flag_that_cannot_be_used_ends_in_one_line(finished, tmp_path, flag):
     _, usual, _ = finished
@@ -289,6 +312,9 @@ def test_a_flag_that_cannot_be_used_ends_in_one_line(finished, tmp_path, flag):
 def test_a_policy_that_is_unknown_or_needs_what_one_field_has_not_is_refused():
     for name in ("bavs", "directional", "coverage", "entropy"):
         suggestion.check_options(options(policy=name))
+    for name in ("random", "coverage", "surface_coverage"):
+        with pytest.raises(SelectionError, match="--refine"):
+            suggestion.check_options(options(policy=name, refine=3))
     refused = {"bavz": "bavz", "oracle": "photos", "activenerf": "field of kind 'variance'"}
     for name, message in refused.items():
         with pytest.raises(SelectionError, match=message):

@@ -9,6 +9,7 @@ import numpy as np
 from bavs_jax.arrays import Array
 from bavs_jax.cameras import Cameras
 from bavs_jax.placement.proposals import aim
+from bavs_jax.progress import Progress
 from bavs_jax.selection.context import Context, mark_picked
 from bavs_jax.selection.policy import Policy
 
@@ -29,6 +30,11 @@ class Ascent(NamedTuple):
     poses: np.ndarray  # [k, 3, 4]
     before: np.ndarray  # [k] score of each where it was chosen, the others chosen too
     after: np.ndarray  # [k] where it is now, the others being where they are now
+
+    def in_words(self) -> str:
+        """Such as `by +3%, +0%, +12%`."""
+        rises = [f"{y / x - 1:+.0%}" for x, y in zip(self.before, self.after) if x > 0.0]
+        return f"by {', '.join(rises)}"
 
 
 def moved(pose, moves, *, up, length: float, angle: float) -> np.ndarray:
@@ -59,6 +65,7 @@ def ascend(
     length: float,
     angle: float,
     steps: int,
+    progress_fn: Progress | None = None,
 ) -> Ascent:
     """Moves each pose in turn to where its score is larger, given the others.
 
@@ -75,6 +82,7 @@ def ascend(
       length, angle: as far as a pose may go from where it begins, along each axis, scene units and
         radians.
       steps: of each pose.
+      progress_fn: called with 1 after each step of a pose.
     """
     poses, start = np.array(poses, np.float64), np.array(poses, np.float64)
     places, step = np.zeros((len(poses), 5)), np.full(len(poses), FIRST_STEP)
@@ -108,6 +116,8 @@ def ascend(
                 places[number], poses[number] = moves[best], trials[best]
             else:
                 step[number] /= 2.0
+            if progress_fn is not None:
+                progress_fn(1)
     after = [_score(score_fn, n, poses, poses[n : n + 1])[0] for n in range(len(poses))]
     return Ascent(poses, before, np.array(after))
 

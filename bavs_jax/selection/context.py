@@ -43,6 +43,7 @@ class Context(struct.PyTreeNode):
     training_positions: Array  # [V, 3] scene units
     is_training_view: Array  # [V] bool
     centre: Array  # [3] scene centre, scene units
+    places: Array  # [P, 3] of cameras, which `spread` is to bring near to a view; the candidates
     mean_uncertainty_fn: MeanUncertaintyFn | None = struct.field(pytree_node=False, default=None)
     # The posterior of the field and what each candidate would add to it (`information.py`).
     information: Information | None = struct.field(pytree_node=False, default=None)
@@ -62,6 +63,7 @@ def make_context(
     centre,
     view_ids=None,
     mask=None,
+    places=None,
     mean_uncertainty_fn: MeanUncertaintyFn | None = None,
     information: Information | None = None,
     directional: DirectionalInformation | None = None,
@@ -77,6 +79,7 @@ def make_context(
       centre: [3] scene centre, scene units.
       view_ids: [C] distinct integers >= 0; default 0 .. C - 1.
       mask: [C] bool, which candidates may be picked; default all.
+      places: [P, 3] see `Context`; default the candidates.
       mean_uncertainty_fn, information, directional, targets, true_error_fn: see
         `Context`.
 
@@ -91,6 +94,7 @@ def make_context(
         "training_positions": np.asarray(training_positions, np.float32),
         "is_training_view": np.asarray(is_training_view, bool),
         "centre": np.asarray(centre, np.float32),
+        "places": np.asarray(positions if places is None else places, np.float32),
     }
     shapes = {
         "positions": (num, 3),
@@ -99,6 +103,7 @@ def make_context(
         "training_positions": (len(training_positions), 3),
         "is_training_view": (len(training_positions),),
         "centre": (3,),
+        "places": (num if places is None else len(places), 3),
     }
     for name, array in arrays.items():
         if array.shape != shapes[name]:

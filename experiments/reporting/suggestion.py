@@ -40,8 +40,7 @@ from experiments.runtime import command_line, device_name, peak_memory_mb, versi
 from experiments.suggestion import Options, Suggestion, in_matter
 from experiments.trained import TrainedRun
 
-SECONDS_PER_VIEW = 2.0
-FPS = 24
+SECONDS_PER_VIEW, FPS = 2.0, 24
 CSV_COLUMNS = (
     *("order", "x", "y", "z", "qx", "qy", "qz", "qw", "look_x", "look_y", "look_z"),
     *("score", "share_of_best", "picked"),
@@ -65,7 +64,8 @@ def write_results(
     `jac_sq_sum` [G, 3] is the curvature of the photos, `begin` when the script began, by
     `time.monotonic`.
     """
-    scene, worth, first = run.problem.scene, found.worth, found.worth.best_left[0]
+    scene, moved = run.problem.scene, found.ascent
+    worth, first = found.worth, found.worth.best_left[0]
     start = options.start
     if start is None:
         start = user_points(scene, scene.cameras.positions)[-1]
@@ -109,6 +109,7 @@ def write_results(
         "best_gain": float(first),  # nats, as the next two
         "best_left": [None if np.isnan(x) else float(x) for x in worth.best_left],
         "photo_gain": found.photo_gain,
+        "refined": moved and {name: getattr(moved, name).tolist() for name in ("before", "after")},
         "worth": worth_words(worth, found.photo_gain),
         "views": [
             row
@@ -260,8 +261,8 @@ def worth_words(worth: Worth, photo_gain: float) -> str:
     left = "none" if np.isnan(worth.best_left[-1]) else f"{worth.best_left[-1]:.3g} nats"
     return (
         f"Information of the best candidate: {worth.best_left[0]:.3g} nats at first, after "
-        f"{len(worth.picked)} picks {left}; of another photo from where there is one: "
-        f"{photo_gain:.3g}. Stop when the last two are about the same."
+        f"{len(worth.picked)} picks {left}; of a photo from where there is one: {photo_gain:.3g}. "
+        "Stop when the last two are about the same."
     )
 
 
@@ -291,6 +292,8 @@ def place_notes(
     )
     clearance = f"clearance {unit * around.clearance:.3g} units"
     lines.append(f"candidates ({options.candidates}): {found.proposals.in_words()}; {clearance}")
+    if found.ascent is not None:
+        lines.append(f"moving the poses raised their scores {found.ascent.in_words()}")
     quality = read_json(run.folder / "round_0.json")
     if quality and quality["num_test_views"]:
         number = quality["num_test_views"]

@@ -31,11 +31,16 @@ def great_circle(a, b, centre):
     return jnp.arctan2(sine, (a * b).sum(-1))
 
 
-def nearest_chosen(ctx, distance: Distance = euclidean):
-    """Distance of each candidate to the nearest training view or pick, [C]."""
+def nearest_to_chosen(ctx, points, distance: Distance = euclidean):
+    """Distance of each point [P, 3] to the nearest training view or pick, [P]."""
     chosen = jnp.concatenate([ctx.training_positions, ctx.positions])
     is_chosen = jnp.concatenate([ctx.is_training_view, ctx.picked])
-    return masked_nearest(distance(ctx.positions, chosen, ctx.centre), is_chosen)
+    return masked_nearest(distance(points, chosen, ctx.centre), is_chosen)
+
+
+def nearest_chosen(ctx, distance: Distance = euclidean):
+    """Distance of each candidate to the nearest training view or pick, [C]."""
+    return nearest_to_chosen(ctx, ctx.positions, distance)
 
 
 def farthest_score(key, ctx, distance: Distance = euclidean):
@@ -45,17 +50,18 @@ def farthest_score(key, ctx, distance: Distance = euclidean):
 
 
 def spread_score(key, ctx):
-    """Mean over all candidates j of how much `min_s |x_j - x_s|^2` falls, scene unit^2.
+    """Mean over all places j of how much `min_s |x_j - x_s|^2` falls, scene unit^2.
 
     As in k-means and facility location. Where farthest-view asks for the one place that is
     farthest from all views, and so goes to the rim, this asks what a view does for all places.
 
-    Over all of `ctx.positions`, `ctx.mask` left aside: what a filter takes away may not be picked,
+    Places are all candidates, `ctx.mask` left aside: what a filter takes away may not be picked,
     but it is still to be looked at.
     """
     del key
-    squared = pairwise_distances(ctx.positions, ctx.positions) ** 2  # [j, candidate]
-    nearest = jnp.minimum(nearest_chosen(ctx) ** 2, squared.max())  # none chosen: all equally far
+    squared = pairwise_distances(ctx.places, ctx.positions) ** 2  # [j, candidate]
+    nearest = nearest_to_chosen(ctx, ctx.places)
+    nearest = jnp.minimum(nearest**2, squared.max())  # none chosen: all equally far
     return jnp.maximum(nearest[:, None] - squared, 0.0).mean(axis=0)
 
 
