@@ -10,14 +10,19 @@ from experiments.runtime import use_compilation_cache
 
 # Set before XLA starts, for tests and for the scripts that they start. Most of a test's time is XLA
 # compiling programs that run once: with few optimisations it takes half as long, and half of that
-# again without the emitters that write fused loops. Later releases of jaxlib may not know the flag,
-# and a process ends at one that it does not know.
-jax.config.update("jax_disable_most_optimizations", True)
-os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
-NO_EMITTERS = "--xla_cpu_use_fusion_emitters=false"
+# again without the emitters that write fused loops. A tenth each take the splitting of a program
+# for several threads, and writing down by which calls each operation came about.
+for option, value in {
+    "jax_disable_most_optimizations": True,
+    "jax_include_full_tracebacks_in_locations": False,
+}.items():
+    jax.config.update(option, value)
+    os.environ[option.upper()] = str(int(value))
+# Later releases of jaxlib may not know the flags, and a process ends at one that it does not know.
+QUICK = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 if importlib.metadata.version("jaxlib").startswith("0.10."):
-    given = os.environ.get("XLA_FLAGS", "").replace(NO_EMITTERS, "")
-    os.environ["XLA_FLAGS"] = f"{NO_EMITTERS} {given}".strip()
+    given = os.environ.get("XLA_FLAGS", "").replace(QUICK, "")
+    os.environ["XLA_FLAGS"] = f"{QUICK} {given}".strip()
 
 # Files that take longest, in any order.
 LONG = (
@@ -60,7 +65,7 @@ def users_compilation(monkeypatch):
     `jax.jit`.
     """
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "0")
-    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", "").replace(NO_EMITTERS, ""))
+    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", "").replace(QUICK, ""))
     jax.config.update("jax_disable_most_optimizations", False)
     yield
     jax.config.update("jax_disable_most_optimizations", True)

@@ -8,14 +8,13 @@ numbers makes the file anew and says why.
 
 import json
 import pathlib
-import subprocess
 import sys
 import tempfile
 
 from bavs_jax.selection.policies import POLICIES
+from tests.script_server import run_script
 from tests.toy_runs import SMALL_NETWORKS, toy_flags
 
-ROOT = pathlib.Path(__file__).parents[1]
 SMALL = {**SMALL_NETWORKS, "num_rounds": 1}
 CASES = {
     "all policies": {"policies": repr(tuple(POLICIES))},
@@ -59,10 +58,9 @@ def run_models() -> dict:
 
 
 def _script(name: str, folder: str, flags: list[str]) -> None:
-    command = [sys.executable, "-m", f"experiments.{name}", f"--workdir={folder}", *flags]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = run_script(f"experiments.{name}", f"--workdir={folder}", *flags, seconds=1200)
     if done.returncode:
-        raise RuntimeError(f"{' '.join(command)}: {done.stderr[-2000:]}")
+        raise RuntimeError(f"{' '.join(done.args)}: {done.stderr[-2000:]}")
 
 
 def main(out: str) -> None:

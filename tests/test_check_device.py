@@ -1,8 +1,6 @@
 """The check of an accelerator against the CPU."""
 
 import json
-import subprocess
-import sys
 
 import jax
 import numpy as np
@@ -10,6 +8,7 @@ import pytest
 
 from experiments.bench import same_numbers, stages
 from experiments.bench.same_numbers import difference, differences_table, too_large
+from tests.script_server import run_script
 
 
 def test_difference_is_relative_and_counts_whole_numbers():
@@ -35,11 +34,11 @@ def test_what_is_too_large_is_named_and_nan_always_is():
 
 
 def test_without_an_accelerator_there_is_nothing_to_compare(tmp_path):
-    command = [sys.executable, "-m", "experiments.check_device", f"--workdir={tmp_path / 'out'}"]
-    done = subprocess.run(command, capture_output=True, text=True)
+    command = ["experiments.check_device", f"--workdir={tmp_path / 'out'}"]
+    done = run_script(*command)
     assert done.returncode == 1 and not (tmp_path / "out").exists()
     assert done.stderr.startswith("error: JAX_PLATFORMS: ") and done.stderr.count("\n") == 1
-    done = subprocess.run([*command, "--fields=grids"], capture_output=True, text=True)
+    done = run_script(*command, "--fields=grids")
     assert "--fields: unknown ['grids']; known: hash_grid, " in done.stderr
 
 

@@ -18,9 +18,9 @@ from experiments.files import append_line, read_arrays, read_json, write_arrays,
 from experiments.reporting.report import write_report
 from experiments.runtime import ReportError, WorkdirError
 from experiments.trained import saved_config
+from tests.script_server import ROOT, run_script
 from tests.toy_runs import TINY, same_results, toy_config, toy_flags
 
-ROOT = pathlib.Path(__file__).parents[1]
 PART = "bavs/seed_0"
 
 
@@ -183,10 +183,8 @@ REFUSED = [
     [pytest.param(*r, marks=[] if r == REFUSED[0] else pytest.mark.slow) for r in REFUSED],
 )
 def test_a_refused_option_leaves_no_folder(tmp_path, script, flags):
-    command = [sys.executable, "-m", f"experiments.{script}", f"--workdir={tmp_path / 'new'}"]
-    done = subprocess.run(
-        [*command, *toy_flags(), *flags], cwd=ROOT, capture_output=True, text=True, timeout=300
-    )
+    workdir = f"--workdir={tmp_path / 'new'}"
+    done = run_script(f"experiments.{script}", workdir, *toy_flags(), *flags)
     assert done.returncode == 1 and done.stderr.startswith("error: ")
     one_line(done.stderr, flags[0][-4:])
     assert not (tmp_path / "new").exists()

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import pathlib
 import subprocess
 import sys
 import time
@@ -19,10 +18,10 @@ from experiments.uncertainty import (
     row_path,
     whole_views,
 )
+from tests.script_server import ROOT, run_script
 from tests.toy_runs import toy_flags
 from tests.toy_scenes import toy_scene
 
-ROOT = pathlib.Path(__file__).parents[1]
 SIZE = 6
 
 
@@ -115,21 +114,14 @@ def finished(tmp_path_factory):
     return base, *run(base, models="('laplace','learned_variance')")
 
 
-def start(base, *, models):
+def command(base, *, models):
     flags = toy_flags(num_rounds=1, evaluation__num_views=2, evaluation__models=models)
-    return subprocess.Popen(
-        [sys.executable, "-m", "experiments.evaluate_uncertainty", f"--workdir={base}", *flags],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    return ["experiments.evaluate_uncertainty", f"--workdir={base}", *flags]
 
 
 def run(base, *, models):
-    process = start(base, models=models)
-    out, err = process.communicate(timeout=300)
-    return process.returncode, out, err
+    done = run_script(*command(base, models=models))
+    return done.returncode, done.stdout, done.stderr
 
 
 def test_script_writes_numbers_curves_and_a_page(finished):
@@ -192,12 +184,13 @@ def test_a_killed_evaluation_goes_on_and_does_nothing_twice(finished):
     base, *_ = finished
     models = ("laplace", "learned_variance", "entropy", "ensemble")
     done = [row_path(base, model, 0) for model in models[:3]]
-    process = start(base, models=str(models).replace(" ", ""))
+    flags = command(base, models=str(models).replace(" ", ""))
+    process = subprocess.Popen([sys.executable, "-m", *flags], cwd=ROOT)
     deadline = time.monotonic() + 300.0
     while not done[-1].exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
     process.kill()
-    process.communicate()
+    process.wait()
     assert done[-1].exists()
     before = [path.stat().st_mtime_ns for path in done]
     code, out, err = run(base, models=str(models).replace(" ", ""))

@@ -2,7 +2,6 @@
 
 import json
 import os
-import pathlib
 import subprocess
 import sys
 from collections import Counter
@@ -12,12 +11,12 @@ import pytest
 from experiments.runtime import ConfigError
 from experiments.schema import SCHEMA, check_config
 from tests.option_server import LIMIT_S, REACHED, WORK
+from tests.script_server import ROOT, run_script
 from tests.test_schema import with_value
 
 hypothesis = pytest.importorskip("hypothesis")
 given, st = hypothesis.given, hypothesis.strategies
 
-ROOT = pathlib.Path(__file__).parents[1]
 CONFIG = ROOT / "experiments" / "configs" / "quickstart.py"
 MAX_GB = 2.0
 NUM_VALUES, NUM_COMMANDS = 1500, 60  # drawn in all, and for each script
@@ -198,14 +197,7 @@ def test_a_bad_command_ends_in_one_line_before_any_work(command, tmp_path):
     if name == "active_selection" and not given & {"--config", "--config.image_size"}:
         argv.append("--config.image_size=16")  # some are refused once the scene is there
     (tmp_path / "work").mkdir()
-    done = subprocess.run(
-        [sys.executable, "-m", f"experiments.{name}", *argv],
-        cwd=ROOT,
-        env=os.environ | {"JAX_PLATFORMS": "cpu"},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    done = run_script(f"experiments.{name}", *argv, seconds=60)
     lines = done.stderr.strip().splitlines()
     assert done.returncode == 1 and len(lines) == 1 and lines[0].startswith("error: "), done.stderr
     assert "train on" not in done.stdout and not list((tmp_path / "work").glob("*/*"))

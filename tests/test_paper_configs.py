@@ -2,10 +2,7 @@
 
 import importlib
 import json
-import os
 import pathlib
-import subprocess
-import sys
 
 import jax
 import numpy as np
@@ -16,6 +13,7 @@ from experiments.build import Problem
 from experiments.configs.paper.protocols import PROTOCOLS, get_config
 from experiments.reporting.run_tables import PAPER
 from tests.scene_files import write_nerfstudio
+from tests.script_server import run_script
 from tests.toy_runs import OVERRIDES
 from tests.toy_scenes import toy_scene
 
@@ -62,16 +60,8 @@ def test_the_protocols_are_the_printed_ones():
 
 
 def test_an_unknown_size_ends_in_one_line():
-    command = "experiments.active_selection --config=experiments/configs/paper/table_1.py:big"
-    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
-    done = subprocess.run(
-        [sys.executable, "-m", *command.split()],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env=environment,
-        check=False,
-    )
+    config = "experiments/configs/paper/table_1.py:big"
+    done = run_script("experiments.active_selection", f"--config={config}")
     assert done.returncode != 0 and len(done.stderr.strip().splitlines()) == 1
     assert "size 'big': use one of laptop, paper" in done.stderr
 
@@ -107,17 +97,10 @@ def test_table_3_runs_on_the_layout_with_true_depth(tmp_path):
     options = kept | {"image_size": 24, "data_dir": tmp_path, "scene": "africa", "seeds": "(0,)"}
     options |= {"evaluation.models": "('laplace','entropy')", "uncertainty.log2_cells": 3}
     work = tmp_path / "work"
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "experiments.evaluate_uncertainty", f"--workdir={work}"),
-            "--config=experiments/configs/paper/protocols.py:table_3",
-            *(f"--config.{name}={value}" for name, value in options.items()),
-        ],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env=os.environ | {"JAX_PLATFORMS": "cpu"},
-        check=False,
+    done = run_script(
+        *("experiments.evaluate_uncertainty", f"--workdir={work}"),
+        "--config=experiments/configs/paper/protocols.py:table_3",
+        *(f"--config.{name}={value}" for name, value in options.items()),
     )
     assert done.returncode == 0, done.stderr
     result = json.loads((work / "uncertainty.json").read_text())

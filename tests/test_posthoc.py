@@ -2,9 +2,6 @@
 
 import io
 import json
-import pathlib
-import subprocess
-import sys
 
 import nrrd
 import numpy as np
@@ -15,22 +12,11 @@ from PIL import Image
 from experiments.build import Problem, load_config_scene
 from experiments.runtime import WorkdirError
 from experiments.trained import choose_runs, field_kind, find_runs, load_run, saved_config
+from tests.script_server import run_script
 from tests.toy_runs import toy_config, toy_flags
 
-ROOT = pathlib.Path(__file__).parents[1]
 POLICY = "random"
 OVERRIDES = {"policies": (POLICY,), "num_rounds": 1}
-
-
-def script(name, *flags):
-    """Runs a script to its end."""
-    return subprocess.run(
-        [sys.executable, "-m", f"experiments.{name}", *flags],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=1200,
-    )
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +24,7 @@ def cleaned(tmp_path_factory):
     """A folder that `clean_up` has filled from nothing, and what it printed."""
     folder = tmp_path_factory.mktemp("posthoc")
     flags = (f"--workdir={folder}", "--num_test=3", "--num_thresholds=6")
-    done = script("clean_up", *toy_flags(**OVERRIDES), *flags)
+    done = run_script("experiments.clean_up", *toy_flags(**OVERRIDES), *flags)
     assert done.returncode == 0, done.stderr
     return folder, done.stdout
 
@@ -86,7 +72,7 @@ def test_clean_up_trains_measures_and_writes(cleaned):
 def test_posterior_draws_takes_up_the_run(cleaned):
     folder, _ = cleaned
     flags = (f"--workdir={folder}", "--num_draws=2", "--num_views=2")
-    done = script("posterior_draws", *flags)
+    done = run_script("experiments.posterior_draws", *flags)
     assert done.returncode == 0, done.stderr
     assert "train on" not in done.stdout
     assert "| training views |" in done.stdout and "| test views |" in done.stdout
@@ -107,7 +93,7 @@ def read_vertices(path):
 def test_exported_files_agree_with_the_field(cleaned, run):
     base, _ = cleaned
     flags = ("--resolution=9", "--num_samples=300", "--density_threshold=0.5")
-    done = script("export_field", f"--workdir={base}", *flags, "--min_opacity=0.01")
+    done = run_script("experiments.export_field", f"--workdir={base}", *flags, "--min_opacity=0.01")
     assert done.returncode == 0, done.stderr
     folder = run.folder / "export"
     names = {"grid.npz", "density.nrrd", "sigma.nrrd", "uncertainty.nrrd"}
@@ -188,6 +174,6 @@ def test_configs_that_cannot_be_used_are_errors(tmp_path):
     ],
 )
 def test_wrong_flags_end_in_one_line(tmp_path, name, flag, message):
-    done = script(name, f"--workdir={tmp_path}", flag)
+    done = run_script(f"experiments.{name}", f"--workdir={tmp_path}", flag)
     assert done.returncode != 0 and "Traceback" not in done.stderr
     assert done.stderr.startswith("error: ") and message in done.stderr

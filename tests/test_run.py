@@ -1,7 +1,6 @@
 """The script as a user runs it: results, resumption after a real kill, errors, exported poses."""
 
 import json
-import pathlib
 import shutil
 import signal
 import subprocess
@@ -15,17 +14,13 @@ from bavs_jax.selection.policies import POLICIES
 from experiments.posthoc.lpips import remeasure
 from experiments.reporting.result_tables import collect_tables
 from experiments.runtime import ConfigError, WorkdirError
+from tests.script_server import ROOT, run_script
 from tests.toy_runs import toy_flags
 
-ROOT = pathlib.Path(__file__).parents[1]
-SCRIPT = [sys.executable, "-m", "experiments.active_selection"]
 
-
-def script(*flags, **kwargs):
+def script(*flags):
     """Runs the script to its end."""
-    return subprocess.run(
-        [*SCRIPT, *flags], cwd=ROOT, capture_output=True, text=True, timeout=300, **kwargs
-    )
+    return run_script("experiments.active_selection", *flags)
 
 
 @pytest.fixture(scope="session")
@@ -109,7 +104,10 @@ def test_killed_run_goes_on_and_ends_like_the_undisturbed_one(finished, tmp_path
     """SIGKILL after a number of log lines, in different rounds; then the same command again."""
     flags = [f"--workdir={tmp_path}", *toy_flags(policies="('bavs',)")]
     process = subprocess.Popen(
-        [*SCRIPT, *flags], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [sys.executable, "-m", "experiments.active_selection", *flags],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     checkpoints, deadline = tmp_path / "bavs" / "seed_0" / "checkpoints", time.monotonic() + 200
     while time.monotonic() < deadline and process.poll() is None:

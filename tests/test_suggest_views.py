@@ -5,8 +5,6 @@ import dataclasses
 import json
 import math
 import pathlib
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -24,6 +22,7 @@ from experiments.reporting.suggestion import worth_words, write_poses
 from experiments.runtime import ConfigError
 from experiments.schema import parse_numbers
 from tests.scene_files import orbit, write_nerfstudio
+from tests.script_server import run_script
 from tests.toy_scenes import toy_scene
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -221,13 +220,7 @@ SMALL = {
 
 def script(*flags):
     small = [f"--config.{name}={value}" for name, value in SMALL.items()]
-    return subprocess.run(
-        [sys.executable, "-m", "experiments.suggest_views", *small, *flags],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+    return run_script("experiments.suggest_views", *small, *flags)
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from experiments.sweeps.plan import (
     setting_name,
     write_record,
 )
+from tests.script_server import run_script
 from tests.sweep_runs import (
     attempts,
     end_of,
@@ -122,9 +123,11 @@ def test_a_run_that_was_stopped_and_killed_ends_like_an_undisturbed_one(disturbe
 def test_a_second_sweep_in_the_same_folder_is_refused(tmp_path):
     flags = [*FLAGS, f"--workdir={tmp_path}"]
     with exclusive(tmp_path):
-        code, out = end_of(start_sweep(flags))
-    assert code == 1 and out.startswith(f"error: {tmp_path}: another process works here; ")
-    assert out.count("\n") == 1 and [*tmp_path.iterdir()] == [tmp_path / ".lock"]
+        done = run_script("experiments.sweep", *flags)
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"error: {tmp_path}: another process works here; ")
+    assert (done.stdout + done.stderr).count("\n") == 1
+    assert [*tmp_path.iterdir()] == [tmp_path / ".lock"]
 
 
 def test_a_sweep_that_is_killed_leaves_no_lock(tmp_path):

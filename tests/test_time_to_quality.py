@@ -11,6 +11,7 @@ import pytest
 
 from experiments.bench.results import QUALITY, first_seconds, plateau, quality_tables
 from experiments.reporting.tables import collected_text
+from tests.script_server import run_script
 from tests.toy_runs import toy_flags
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -66,6 +67,6 @@ def test_script_measures_with_a_cold_and_a_warm_cache(tmp_path):
 
 
 def test_targets_that_are_no_numbers_are_refused(tmp_path):
-    command = [sys.executable, "-m", "experiments.time_to_quality", f"--workdir={tmp_path}"]
-    done = subprocess.run([*command, "--targets=25,high"], capture_output=True, text=True, cwd=ROOT)
+    command = ["experiments.time_to_quality", f"--workdir={tmp_path}", "--targets=25,high"]
+    done = run_script(*command)
     assert done.returncode == 1 and done.stderr.startswith("error: --targets: ")

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student_t
+from scipy.special import stdtr, stdtrit  # scipy.stats takes a second of every start to import
 
 from experiments.reporting.results import Run
 
@@ -44,7 +44,7 @@ def mean_interval(values: Iterable[float] | dict[int, float]) -> Interval | None
     numbers = np.array([*(values.values() if isinstance(values, dict) else values)], np.float64)
     if numbers.size < 2:
         return Interval(float(numbers[0]), None, 1) if numbers.size else None
-    half = student_t.ppf(0.975, numbers.size - 1) * numbers.std(ddof=1) / np.sqrt(numbers.size)
+    half = stdtrit(numbers.size - 1, 0.975) * numbers.std(ddof=1) / np.sqrt(numbers.size)
     return Interval(float(numbers.mean()), float(half), numbers.size)
 
 
@@ -60,8 +60,8 @@ def paired_p_value(gap: Interval) -> float | None:
         return None
     if gap.half == 0.0:
         return float(gap.mean == 0.0)
-    standard_error = gap.half / student_t.ppf(0.975, gap.num - 1)
-    return float(2.0 * student_t.sf(abs(gap.mean) / standard_error, gap.num - 1))
+    standard_error = gap.half / stdtrit(gap.num - 1, 0.975)
+    return float(2.0 * stdtr(gap.num - 1, -abs(gap.mean) / standard_error))
 
 
 # --- of runs ---
