@@ -19,8 +19,8 @@ from bavs_jax.metrics.perceptual import make_lpips_fn
 from bavs_jax.models.base import RadianceModel
 from bavs_jax.pixel_table import make_pixel_table, num_training_pixels
 from bavs_jax.policy_inputs import InputMaker, LookOptions
-from bavs_jax.scenes import Scene, SceneError, load_scene, sculpture
-from bavs_jax.scenes.procedural import capture
+from bavs_jax.scenes import Scene, SceneError, load_scene
+from bavs_jax.scenes.procedural import capture, subject
 from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.training.fit import Trainer, is_stuck, single_colour_error
@@ -77,7 +77,9 @@ def stream_key(seed: int, stream: str) -> jax.Array:
 def load_config_scene(config, *, cache_dir: str | None) -> Scene:
     """The scene that a config names; SceneError if its files cannot be used."""
     if config.loader == "procedural":
-        return load_scene("procedural", image_size=config.image_size, cache_dir=cache_dir)
+        return load_scene(
+            "procedural", scene=config.scene, image_size=config.image_size, cache_dir=cache_dir
+        )
     folder, default = config.data_dir, os.environ.get("BAVS_DATA")
     if not folder and not default:
         raise SceneError(
@@ -93,7 +95,7 @@ def load_config_scene(config, *, cache_dir: str | None) -> Scene:
 
 def true_surface(config) -> Callable | None:
     """Signed distance to the surface of a config's scene, where it is known: [..., 3] -> [...]."""
-    return sculpture.signed_distance if config.loader == "procedural" else None
+    return subject(config.scene).signed_distance if config.loader == "procedural" else None
 
 
 def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:
@@ -112,7 +114,7 @@ def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:
 
 def _takes_pictures(config) -> bool:
     """Whether candidates are free poses, whose pictures are taken when they are chosen."""
-    return config.candidates.source == "hemisphere" and config.loader == "procedural"
+    return config.candidates.source != "dataset" and config.loader == "procedural"
 
 
 def check_views(config, scene: Scene) -> None:
@@ -121,7 +123,7 @@ def check_views(config, scene: Scene) -> None:
     left = len(scene.pool) - len(initial_views(scene, 0, config.num_initial))
     taken, draws = num_rounds * batch, options.hemisphere_draws
     rounds = f"config.batch_size: {num_rounds} rounds of {batch} take {taken}"
-    if options.source == "hemisphere" and num_rounds and batch > draws:
+    if options.source != "dataset" and num_rounds and batch > draws:
         raise ConfigError(
             f"config.batch_size: is {batch}; give at most candidates.hemisphere_draws, {draws}"
         )
@@ -182,13 +184,14 @@ class Problem:
         self.mesh, self.track = mesh, track
         # Where candidates come from, and the table with room for pictures taken on the way.
         options, table = config.candidates, make_pixel_table(scene)
-        draws = options.hemisphere_draws if options.source == "hemisphere" else None
+        draws = options.hemisphere_draws if options.source != "dataset" else None
         if _takes_pictures(config):
             self.source = captured_candidates(
                 scene,
-                lambda cameras: capture(cameras)[:2],
+                lambda cameras: capture(cameras, config.scene)[:2],
                 num_candidates=draws,
                 first_slot=len(table.cameras),
+                draw_poses=subject(config.scene).draw_poses if options.source == "free" else None,
             )
             table = with_empty_views(table, config.num_rounds * config.batch_size)
         else:

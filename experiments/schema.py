@@ -14,6 +14,7 @@ from bavs_jax.metrics.ause import ERRORS, variant_name
 from bavs_jax.metrics.perceptual import NETS
 from bavs_jax.scenes import LOADERS
 from bavs_jax.scenes.lightfield import SPLITS
+from bavs_jax.scenes.procedural import SUBJECTS
 from bavs_jax.selection.policies import POLICIES
 from bavs_jax.selection.policy import MODES
 from bavs_jax.uncertainty.channel import EXTENTS, SCALES, VARIANTS
@@ -128,7 +129,7 @@ _OPTIONS_OF_A_KIND = {
     "uncertainty.extent": choice(*EXTENTS),
     "evaluation.variant": choice(*AUSE_VARIANTS),
     "evaluation.interval_scale": choice(*INTERVAL_SCALES),
-    "candidates.source": choice("dataset", "hemisphere"),
+    "candidates.source": choice("dataset", "hemisphere", "free"),
     "candidates.mode": default(choice(*MODES), "the policy's own"),
     "view_seed": default(SEED, "each seed its own"),
     # tuples
@@ -240,7 +241,28 @@ def check_config(config: ConfigDict, *more: str, name: str = "config") -> Config
             f"{name}.candidates: give both min_train_distance and min_candidate_distance, "
             "or neither"
         )
+    _check_scene(values, name)
     return config
+
+
+def _check_scene(values: dict, name: str) -> None:
+    """Raises ConfigError for a procedural scene that there is not, and where cameras cannot go."""
+    loader, scene, source = (values[o] for o in ("loader", "scene", "candidates.source"))
+    if loader != "procedural":
+        if source == "free":
+            raise ConfigError(
+                f"{name}.candidates.source: is 'free', which takes pictures on the way, and "
+                f"{name}.loader is {shown(loader)}; give 'dataset', 'hemisphere', or the loader "
+                "'procedural'"
+            )
+    elif scene not in SUBJECTS:
+        known = ", ".join(map(repr, SUBJECTS))
+        raise ConfigError(f"{name}.scene: is {shown(scene)}; the loader has {known}: give one")
+    elif source == "hemisphere" and not SUBJECTS[scene].from_around:
+        raise ConfigError(
+            f"{name}.candidates.source: is 'hemisphere', which lies beyond the walls of {scene!r}; "
+            "give 'dataset' or 'free'"
+        )
 
 
 def check_options(config: ConfigDict, schema: dict[str, Option], name: str) -> dict:

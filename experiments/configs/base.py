@@ -10,7 +10,7 @@ def get_config() -> ConfigDict:
     # --- the scene ---
     config.loader = "procedural"  # a key of bavs_jax.scenes.LOADERS
     config.data_dir = placeholder(str)  # folder of scenes; None: $BAVS_DATA/<loader>
-    config.scene = "sculpture"  # folder in data_dir (the procedural scene has just this one)
+    config.scene = "sculpture"  # folder in data_dir; of "procedural": "sculpture" or "interior"
     config.image_size = 100  # pixels of the image width; 0: as the files are
 
     # --- how its files are read (bavs_jax/scenes); None: as the loader sees fit ---
@@ -160,8 +160,9 @@ def get_config() -> ConfigDict:
 
     # --- candidates (bavs_jax/candidates.py, bavs_jax/selection) ---
     config.candidates = ConfigDict()
-    config.candidates.source = "dataset"  # "dataset" or "hemisphere" (Eq 14)
-    config.candidates.hemisphere_draws = 100
+    # "dataset", "hemisphere" (Eq 14), or "free": as the views of a procedural scene are drawn.
+    config.candidates.source = "dataset"
+    config.candidates.hemisphere_draws = 100  # poses drawn each round, unless from the dataset
     config.candidates.image_scale = 0.25  # of width and height, for the score (Eq 15)
     config.candidates.mode = placeholder(str)  # "top_k", "greedy"; None: the policy's own
     # Of the max-min distance filter, scene units; None: 0.2 x median camera distance.
