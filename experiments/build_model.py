@@ -16,6 +16,7 @@ from bavs_jax.fields import flow_field, hash_grid, nerf_mlp
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.flow_field import FlowField, FlowOptions
 from bavs_jax.fields.hash_grid import HashGridOptions
+from bavs_jax.fields.near import with_even_gradients
 from bavs_jax.fields.nerf_mlp import NerfMlpOptions
 from bavs_jax.fields.positional import PIXEL_TO_RADIUS
 from bavs_jax.models import objectives
@@ -39,6 +40,7 @@ RENDER_CAPACITY = 2 * RENDER_CHUNK  # samples of one of its passes: rays of a tr
 SHARES = (0.5, 1.0)  # of the sample buffer, for steps with fewer samples; each compiles once more
 SPARE = 1.1  # times the places that one batch needs are enough for the next ones
 YOUNG = 256  # steps, in which a field changes too fast to say what the next ones need
+THIN_SHARE = 1 / 15  # of the optical depth before training, in a room that cameras stand in
 # What can sample each kind of field; the first that suits the scene is the default.
 SAMPLERS = {
     "hash_grid": ("occupancy", "proposal"),
@@ -81,12 +83,20 @@ def build_field(
         )
     options = {"contracted": contracted, "learned_variance": learned_variance}
     if kind == "hash_grid":
-        grid = HashGridOptions(**config.hash_grid)
+        grid = _grid_options(config, scene)
         field = hash_grid.make_hash_grid_field(box, grid, num_views=num_views, **options)
     else:
         options["pixel_radius"] = _pixel_radius(scene) if kind == "mip_mlp" else None
         field = nerf_mlp.make_nerf_mlp_field(box, _mlp_options(config), **options)
     return field, _build_sampler(config, scene, sampler_kind)
+
+
+def _grid_options(config, scene: Scene) -> HashGridOptions:
+    options = HashGridOptions(**config.hash_grid)
+    if scene.closed:  # nothing lies behind that a fog would have to hide: see `march`
+        thin = THIN_SHARE * options.initial_optical_depth
+        options = dataclasses.replace(options, initial_optical_depth=thin)
+    return options
 
 
 def _mlp_options(config) -> NerfMlpOptions:
@@ -98,7 +108,7 @@ def build_flow(config, scene: Scene) -> FlowField:
     """The distribution over fields that goes with a config's kind of field."""
     flow, where = FlowOptions(**config.flow), {"contracted": scene.unbounded}
     if config.field_kind == "hash_grid":
-        grid = HashGridOptions(**config.hash_grid)
+        grid = _grid_options(config, scene)
         return flow_field.make_flow_field(scene.box, grid, flow, **where)
     return flow_field.make_flow_mlp_field(scene.box, _mlp_options(config), flow, **where)
 
@@ -106,6 +116,11 @@ def build_flow(config, scene: Scene) -> FlowField:
 def _pixel_radius(scene: Scene) -> float:
     """Radius of a pixel's cone at distance 1, for the scene's median focal length."""
     return PIXEL_TO_RADIUS / float(np.median(scene.cameras.intrinsics[:, :2]))
+
+
+def _mean_side(scene: Scene) -> float:
+    """Of the scene box, scene units."""
+    return float(np.mean(scene.box[1] - scene.box[0]))
 
 
 def _background(scene: Scene) -> np.ndarray | None:
@@ -120,12 +135,12 @@ def _build_sampler(config, scene: Scene, kind: str) -> Sampler:
     near, far, box = scene.near, scene.far, scene.box
     if kind == "occupancy":
         limits = only(config.march, "num_steps", "num_slots")
-        march_options = make_march_options(box, near=near, far=far, **limits)
+        march_options = make_march_options(box, near=near, far=far, closed=scene.closed, **limits)
         return make_occupancy_sampler(
             box, march_options, resolution=config.march.occupancy_resolution
         )
     if scene.unbounded:
-        unit = float(np.mean(box[1] - box[0]) / 2)
+        unit = 0.5 * _mean_side(scene)
         far = max(config.proposal.far * unit, far)
         interval_fn = partial(open_intervals, near=near, far=far, unit=unit)
     else:
@@ -185,13 +200,16 @@ def build_model(
             f"config.train.capacity: {capacity} samples of a device cannot hold the "
             f"{sampler.num_slots} of one ray (config.march.num_slots): give more"
         )
+    trained = field
+    if scene.closed:  # cameras stand amid what they see
+        trained = with_even_gradients(field, distance=0.5 * _mean_side(scene))
     if kind == FLOW:
         field = flow_field.mean_field(flow)
         objective = objectives.make_flow_objective(flow, mesh=mesh, **config.flow_training)
     elif kind == VARIANCE:
-        objective = objectives.make_variance_objective(field, mesh=mesh)
+        objective = objectives.make_variance_objective(trained, mesh=mesh)
     else:
-        objective = objectives.make_colour_objective(field, mesh=mesh)
+        objective = objectives.make_colour_objective(trained, mesh=mesh)
     training = RayTraining(
         objective,
         capacity=capacity,

@@ -258,7 +258,7 @@ def _check_scene(values: dict, name: str) -> None:
     elif scene not in SUBJECTS:
         known = ", ".join(map(repr, SUBJECTS))
         raise ConfigError(f"{name}.scene: is {shown(scene)}; the loader has {known}: give one")
-    elif source == "hemisphere" and not SUBJECTS[scene].from_around:
+    elif source == "hemisphere" and SUBJECTS[scene].closed:
         raise ConfigError(
             f"{name}.candidates.source: is 'hemisphere', which lies beyond the walls of {scene!r}; "
             "give 'dataset' or 'free'"

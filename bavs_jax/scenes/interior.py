@@ -20,7 +20,7 @@ from bavs_jax.scenes.shading import Colour, mirrored, mix, nearest_paint, openne
 # Shape; half sides, radii and places in scene units. The niche reaches into the room, so that its
 # opening is no surface.
 ROOM = ((0.0, 0.0, 0.0), (1.4, 1.1, 0.6))
-NICHE = ((0.95, 1.1, -0.02), (0.28, 0.3, 0.3))
+NICHE = ((0.95, 1.1, -0.02), (0.28, 0.25, 0.3))
 LEFT_PARTITION = ((-0.45, 0.75, 0.0), (0.06, 0.45, 0.7))
 RIGHT_PARTITION = ((0.5, -0.75, 0.0), (0.06, 0.45, 0.7))
 WINDOW = ((0.5, -0.72, 0.1), (0.2, 0.22, 0.22))
@@ -31,9 +31,9 @@ TABLE_LEG = ((-1.0, 0.62, -0.45), 0.07, 0.22)
 RING = ((-1.0, 0.62, -0.045), 0.12, 0.045)
 BENCH = ((-0.15, -0.86, -0.47), (0.3, 0.16, 0.13))
 BALL = ((1.0, -0.65, -0.36), 0.24)
-URN = ((0.95, 1.15, -0.2), (0.95, 1.15, -0.05), 0.11)
+URN = ((0.95, 1.18, -0.2), (0.95, 1.18, -0.05), 0.11)
 ROUNDING = 0.02
-SCENE_BOX = ((-1.5, -1.2, -0.7), (1.5, 1.5, 0.7))  # holds all surfaces that can be seen
+SCENE_BOX = ((-1.45, -1.15, -0.65), (1.45, 1.4, 0.65))  # holds all surfaces that can be seen
 
 # Paint, sRGB.
 OAK, STRAW = (0.50, 0.33, 0.20), (0.80, 0.66, 0.44)

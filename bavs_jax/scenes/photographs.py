@@ -34,7 +34,7 @@ class Subject(NamedTuple):
     shade: Callable[[sdf.Point, sdf.Point], sdf.Point]  # colour by place and view direction
     interval: Callable[..., tuple[jax.Array, jax.Array]]  # of rays or cones: where to look
     draw_poses: Callable[[jax.Array, int], np.ndarray]  # key, num -> [num, 3, 4]
-    from_around: bool  # whether cameras stand around it, so that Eq 14 may place some
+    closed: bool  # whether one stands within it, not around it: each ray ends on the surface
     field_of_view: float  # radians across the width
     box: Box  # lower and upper corner, scene units
     near: float  # scene units, as in `Scene`

@@ -70,7 +70,7 @@ SUBJECTS = {
         shade=sculpture.shade,
         interval=ball_interval,
         draw_poses=orbit_poses,
-        from_around=True,
+        closed=False,
         field_of_view=FIELD_OF_VIEW,
         box=((-1.0,) * 3, (1.0,) * 3),
         near=CAMERA_RADIUS - np.sqrt(3.0),  # the box's corners
@@ -80,13 +80,13 @@ SUBJECTS = {
     ),
     "interior": Subject(
         name="interior",
-        version=1,
+        version=2,
         distance=interior.distance,
         signed_distance=interior.signed_distance,
         shade=interior.shade,
         interval=room_interval,
         draw_poses=interior.room_poses,
-        from_around=False,
+        closed=True,
         field_of_view=interior.FIELD_OF_VIEW,
         box=interior.SCENE_BOX,
         near=0.9 * interior.CLEARANCE,  # cameras stand free
@@ -230,5 +230,6 @@ def load_procedural(
             + [f"test_{i:03d}" for i in range(num_test)]
         ),
         depth=photos.depth,
-        alpha=None if (photos.alpha == 255).all() else photos.alpha,
+        alpha=None if seen.closed else photos.alpha,
+        closed=seen.closed,
     )

@@ -53,7 +53,8 @@ def get_config() -> ConfigDict:
     config.hash_grid.log2_table_size = 16
     config.hash_grid.width = 64
     config.hash_grid.geometry_features = 15
-    config.hash_grid.initial_optical_depth = 0.3  # of a side of the scene box, before training
+    # Of a side of the scene box, before training; in a room that cameras stand in a 15th of it.
+    config.hash_grid.initial_optical_depth = 0.3
     config.hash_grid.direction_degree = 2  # spherical-harmonics bands, 1 .. 4
     config.hash_grid.appearance_features = 0  # of a code for each view trained on; 0: none
 
