@@ -16,7 +16,6 @@ from bavs_jax.fields import flow_field, hash_grid, nerf_mlp
 from bavs_jax.fields.base import Field
 from bavs_jax.fields.flow_field import FlowField, FlowOptions
 from bavs_jax.fields.hash_grid import HashGridOptions
-from bavs_jax.fields.near import with_even_gradients
 from bavs_jax.fields.nerf_mlp import NerfMlpOptions
 from bavs_jax.fields.positional import PIXEL_TO_RADIUS
 from bavs_jax.models import objectives
@@ -118,11 +117,6 @@ def _pixel_radius(scene: Scene) -> float:
     return PIXEL_TO_RADIUS / float(np.median(scene.cameras.intrinsics[:, :2]))
 
 
-def _mean_side(scene: Scene) -> float:
-    """Of the scene box, scene units."""
-    return float(np.mean(scene.box[1] - scene.box[0]))
-
-
 def _background(scene: Scene) -> np.ndarray | None:
     """What lies behind everything: in an unbounded scene the last sample of each ray."""
     return None if scene.unbounded else np.asarray(scene.background, np.float32)
@@ -140,7 +134,7 @@ def _build_sampler(config, scene: Scene, kind: str) -> Sampler:
             box, march_options, resolution=config.march.occupancy_resolution
         )
     if scene.unbounded:
-        unit = 0.5 * _mean_side(scene)
+        unit = float(np.mean(box[1] - box[0]) / 2)
         far = max(config.proposal.far * unit, far)
         interval_fn = partial(open_intervals, near=near, far=far, unit=unit)
     else:
@@ -200,16 +194,13 @@ def build_model(
             f"config.train.capacity: {capacity} samples of a device cannot hold the "
             f"{sampler.num_slots} of one ray (config.march.num_slots): give more"
         )
-    trained = field
-    if scene.closed:  # cameras stand amid what they see
-        trained = with_even_gradients(field, distance=0.5 * _mean_side(scene))
     if kind == FLOW:
         field = flow_field.mean_field(flow)
         objective = objectives.make_flow_objective(flow, mesh=mesh, **config.flow_training)
     elif kind == VARIANCE:
-        objective = objectives.make_variance_objective(trained, mesh=mesh)
+        objective = objectives.make_variance_objective(field, mesh=mesh)
     else:
-        objective = objectives.make_colour_objective(trained, mesh=mesh)
+        objective = objectives.make_colour_objective(field, mesh=mesh)
     training = RayTraining(
         objective,
         capacity=capacity,

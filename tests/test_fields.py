@@ -5,12 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bavs_jax.cameras import Rays
 from bavs_jax.fields.encodings import interpolate_level, level_resolutions, spherical_harmonics
 from bavs_jax.fields.hash_grid import HashGridOptions, make_hash_grid_field
-from bavs_jax.fields.near import with_even_gradients
 from bavs_jax.numerics import density_from_raw, safe_divide, safe_reciprocal
-from bavs_jax.rendering.sampling import Samples, flatten_inputs, sample_positions
 from tests.oracles_rendering import interpolate_level_loop
 
 BOX = np.array([[-1.0, -2.0, -1.0], [1.0, 2.0, 3.0]], np.float32)
@@ -132,33 +129,3 @@ def test_safe_division_and_reciprocal():
     assert safe_divide(jnp.float32(3.0), jnp.float32(0.0)) == 0.0
     assert jax.grad(safe_divide, argnums=1)(3.0, 0.0) == 0.0
     np.testing.assert_allclose(safe_reciprocal(jnp.array([0.0, -0.0, 2.0])), [1e12, -1e12, 0.5])
-
-
-def test_even_gradients_are_scaled_by_the_square_of_the_distance_and_values_are_not():
-    options = HashGridOptions(num_levels=2, finest=32, width=8, log2_table_size=10)
-    field = make_hash_grid_field(BOX, options, num_views=1)
-    even = with_even_gradients(field, distance=1.5)
-    params = field.init(jax.random.key(0))
-    rng = np.random.default_rng(0)
-    t = rng.uniform(0.1, 4.0, (3, 4))
-    samples = Samples(jnp.asarray(t), jnp.ones((3, 4)), jnp.ones((3, 4), bool), jnp.zeros(3, bool))
-    rays = Rays(jnp.zeros((3, 3)), jnp.eye(3))
-    inputs = flatten_inputs(even.inputs(rays, samples, jnp.zeros(3, int)))
-    where = sample_positions(rays, samples).reshape(-1, 3), jnp.repeat(jnp.eye(3), 4, 0)
-    by_density, by_rgb = jnp.asarray(rng.normal(size=12)), jnp.asarray(rng.normal(size=(12, 3)))
-
-    def loss(apply_fn, share, params):
-        density, rgb = apply_fn(params, *where)
-        return (share * by_density * density).sum() + (share[:, None] * by_rgb * rgb).sum()
-
-    def even_fn(*args):
-        return even.apply(*args, **inputs)
-
-    for got, want in zip(even_fn(params, *where), field.apply(params, *where)):
-        np.testing.assert_allclose(got, want, rtol=1e-6)
-    # By hand: 1 beyond the distance, its square before; of a linear loss it is a weight.
-    share = jnp.asarray([min(1.0, (x / 1.5) ** 2) for x in t.ravel()])
-    assert 0.0 < (share < 1.0).mean() < 1.0
-    got = jax.grad(lambda p: loss(even_fn, jnp.ones(12), p))(params)
-    want = jax.grad(lambda p: loss(field.apply, share, p))(params)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), got, want)
