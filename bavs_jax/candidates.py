@@ -80,20 +80,25 @@ def captured_candidates(
     *,
     num_candidates: int,
     first_slot: int,
+    draw_poses: Callable[[jax.Array, int], np.ndarray] | None = None,
 ) -> CandidateSource:
-    """Free poses on the hemisphere (Eq 14), photographed when they are chosen.
+    """Free poses, photographed when they are chosen.
 
     Args:
       scene: the scene, with empty views from `first_slot` on (see `with_empty_views`).
       capture_fn: from k cameras to pixels [k * H * W, 3] and alpha [k * H * W], both uint8.
       num_candidates: C.
       first_slot: first view that a picture may be put into.
+      draw_poses: from a key and C to poses [C, 3, 4]; None: on the hemisphere (Eq 14).
     """
     first_view = take(scene.cameras, np.asarray(scene.pool)[:1])
 
     def propose(key, table, is_training_view):
         del table, is_training_view
-        poses = scene_hemisphere(key, scene, num_candidates)
+        if draw_poses is None:
+            poses = scene_hemisphere(key, scene, num_candidates)
+        else:
+            poses = draw_poses(key, num_candidates)
         cameras = jax.tree.map(lambda x: np.repeat(np.asarray(x), num_candidates, 0), first_view)
         return Candidates(
             cameras.replace(world_from_cam=poses),

@@ -24,8 +24,8 @@ from bavs_jax.metrics.perceptual import make_lpips_fn
 from bavs_jax.models.base import RadianceModel
 from bavs_jax.pixel_table import make_pixel_table, num_training_pixels
 from bavs_jax.policy_inputs import InputMaker, LookOptions
-from bavs_jax.scenes import Scene, SceneError, load_scene, pools, sculpture
-from bavs_jax.scenes.procedural import capture
+from bavs_jax.scenes import Scene, SceneError, load_scene, pools
+from bavs_jax.scenes.procedural import capture, subject
 from bavs_jax.scenes.zoom import Zoom
 from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
@@ -98,7 +98,7 @@ def load_config_scene(config, *, cache_dir: str | None) -> Scene:
 def _load(config, cache_dir: str | None, zoom: Zoom | None) -> Scene:
     if config.loader == "procedural":
         options = {"image_size": config.image_size, "cache_dir": cache_dir, "zoom": zoom}
-        return load_scene("procedural", **options)
+        return load_scene("procedural", scene=config.scene, **options)
     folder, default = config.data_dir, os.environ.get("BAVS_DATA")
     if not folder and not default:
         raise SceneError(
@@ -114,7 +114,7 @@ def _load(config, cache_dir: str | None, zoom: Zoom | None) -> Scene:
 
 def true_surface(config) -> Callable | None:
     """Signed distance to the surface of a config's scene, where it is known: [..., 3] -> [...]."""
-    return sculpture.signed_distance if config.loader == "procedural" else None
+    return subject(config.scene).signed_distance if config.loader == "procedural" else None
 
 
 def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:
@@ -136,7 +136,7 @@ def initial_views(scene: Scene, seed: int, num: int) -> np.ndarray:
 
 def _takes_pictures(config) -> bool:
     """Whether candidates are free poses, whose pictures are taken when they are chosen."""
-    return config.candidates.source == "hemisphere" and config.loader == "procedural"
+    return config.candidates.source != "dataset" and config.loader == "procedural"
 
 
 def check_views(config, scene: Scene) -> None:
@@ -145,7 +145,7 @@ def check_views(config, scene: Scene) -> None:
     left = len(scene.pool) - len(initial_views(scene, 0, config.num_initial))
     taken, draws = num_rounds * batch, options.hemisphere_draws
     rounds = f"config.batch_size: {num_rounds} rounds of {batch} take {taken}"
-    if options.source == "hemisphere" and num_rounds and batch > draws:
+    if options.source != "dataset" and num_rounds and batch > draws:
         raise ConfigError(
             f"config.batch_size: is {batch}; give at most candidates.hemisphere_draws, {draws}"
         )
@@ -206,13 +206,14 @@ class Problem:
         self.mesh, self.track = mesh, track
         # Where candidates come from, and the table with room for pictures taken on the way.
         options, table = config.candidates, make_pixel_table(scene)
-        draws = options.hemisphere_draws if options.source == "hemisphere" else None
+        draws = options.hemisphere_draws if options.source != "dataset" else None
         if _takes_pictures(config):
             self.source = captured_candidates(
                 scene,
-                lambda cameras: capture(cameras)[:2],
+                lambda cameras: capture(cameras, config.scene)[:2],
                 num_candidates=draws,
                 first_slot=len(table.cameras),
+                draw_poses=subject(config.scene).draw_poses if options.source == "free" else None,
             )
             table = with_empty_views(table, config.num_rounds * config.batch_size)
         else:

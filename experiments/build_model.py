@@ -39,6 +39,7 @@ RENDER_CAPACITY = 2 * RENDER_CHUNK  # samples of one of its passes: rays of a tr
 SHARES = (0.5, 1.0)  # of the sample buffer, for steps with fewer samples; each compiles once more
 SPARE = 1.1  # times the places that one batch needs are enough for the next ones
 YOUNG = 256  # steps, in which a field changes too fast to say what the next ones need
+THIN_SHARE = 1 / 15  # of the optical depth before training, in a room that cameras stand in
 # What can sample each kind of field; the first that suits the scene is the default.
 SAMPLERS = {
     "hash_grid": ("occupancy", "proposal"),
@@ -81,12 +82,20 @@ def build_field(
         )
     options = {"contracted": contracted, "learned_variance": learned_variance}
     if kind == "hash_grid":
-        grid = HashGridOptions(**config.hash_grid)
+        grid = _grid_options(config, scene)
         field = hash_grid.make_hash_grid_field(box, grid, num_views=num_views, **options)
     else:
         options["pixel_radius"] = _pixel_radius(scene) if kind == "mip_mlp" else None
         field = nerf_mlp.make_nerf_mlp_field(box, _mlp_options(config), **options)
     return field, _build_sampler(config, scene, sampler_kind)
+
+
+def _grid_options(config, scene: Scene) -> HashGridOptions:
+    options = HashGridOptions(**config.hash_grid)
+    if scene.closed:  # nothing lies behind that a fog would have to hide: see `march`
+        thin = THIN_SHARE * options.initial_optical_depth
+        options = dataclasses.replace(options, initial_optical_depth=thin)
+    return options
 
 
 def _mlp_options(config) -> NerfMlpOptions:
@@ -98,7 +107,7 @@ def build_flow(config, scene: Scene) -> FlowField:
     """The distribution over fields that goes with a config's kind of field."""
     flow, where = FlowOptions(**config.flow), {"contracted": scene.unbounded}
     if config.field_kind == "hash_grid":
-        grid = HashGridOptions(**config.hash_grid)
+        grid = _grid_options(config, scene)
         return flow_field.make_flow_field(scene.box, grid, flow, **where)
     return flow_field.make_flow_mlp_field(scene.box, _mlp_options(config), flow, **where)
 
@@ -120,7 +129,7 @@ def _build_sampler(config, scene: Scene, kind: str) -> Sampler:
     near, far, box = scene.near, scene.far, scene.box
     if kind == "occupancy":
         limits = only(config.march, "num_steps", "num_slots")
-        march_options = make_march_options(box, near=near, far=far, **limits)
+        march_options = make_march_options(box, near=near, far=far, closed=scene.closed, **limits)
         return make_occupancy_sampler(
             box, march_options, resolution=config.march.occupancy_resolution
         )

@@ -283,7 +283,9 @@ def saved_part(problem: Problem, state: ActiveState):
     }
     if problem.has_empty_views:
         first, table = int(problem.scene.offsets[-1]), state.table
-        saved |= {"new_pixels": table.pixels[first:], "new_alpha": table.alpha[first:]}
+        saved["new_pixels"] = table.pixels[first:]
+        if problem.scene.alpha is not None:  # an opaque scene's table has none
+            saved["new_alpha"] = table.alpha[first:]
     return saved
 
 
@@ -294,10 +296,9 @@ def whole_state(problem: Problem, saved) -> ActiveState:
     table = table.replace(cameras=cameras)
     if problem.has_empty_views:
         first = int(problem.scene.offsets[-1])
-        table = table.replace(
-            pixels=table.pixels.at[first:].set(saved.pop("new_pixels")),
-            alpha=table.alpha.at[first:].set(saved.pop("new_alpha")),
-        )
+        table = table.replace(pixels=table.pixels.at[first:].set(saved.pop("new_pixels")))
+        if problem.scene.alpha is not None:
+            table = table.replace(alpha=table.alpha.at[first:].set(saved.pop("new_alpha")))
     return ActiveState(table=table, **saved)
 
 

@@ -16,6 +16,7 @@ from bavs_jax.metrics.perceptual import NETS
 from bavs_jax.scenes import LOADERS
 from bavs_jax.scenes.lightfield import SPLITS
 from bavs_jax.scenes.pools import KINDS as POOLS
+from bavs_jax.scenes.procedural import SUBJECTS
 from bavs_jax.selection.policies import POLICIES
 from bavs_jax.selection.policy import MODES
 from bavs_jax.uncertainty.channel import EXTENTS, SCALES, VARIANTS
@@ -135,7 +136,7 @@ _OPTIONS_OF_A_KIND = {
     "targets.kind": choice(*TARGET_KINDS),
     "evaluation.variant": choice(*AUSE_VARIANTS),
     "evaluation.interval_scale": choice(*INTERVAL_SCALES),
-    "candidates.source": choice("dataset", "hemisphere"),
+    "candidates.source": choice("dataset", "hemisphere", "free"),
     "pool.kind": choice(*POOLS),
     "candidates.mode": default(choice(*MODES), "the policy's own"),
     "view_seed": default(SEED, "each seed its own"),
@@ -253,6 +254,7 @@ def check_config(config: ConfigDict, *more: str, name: str = "config") -> Config
             f"{name}.candidates: give both min_train_distance and min_candidate_distance, "
             "or neither"
         )
+    _check_scene(values, name)
     check_pool(values, name)
     if (values["targets.kind"] == "file") != bool(values["targets.poses_file"]):
         raise ConfigError(
@@ -269,11 +271,32 @@ def check_pool(values: dict, name: str) -> None:
             f"{name}.batch_size: is {batch}, but in a pool of kind 'reachable' each view is "
             "reached from the one before: give 1, and more num_rounds, as configs/reachable.py does"
         )
-    is_free = values["loader"] == "procedural" and values["candidates.source"] == "hemisphere"
+    source = values["candidates.source"]
+    is_free = values["loader"] == "procedural" and source != "dataset"
     if is_free and kind in ("unbalanced", "zoom"):
         raise ConfigError(
-            f"{name}.candidates.source: is 'hemisphere', whose free poses are of no pool, but "
+            f"{name}.candidates.source: is {source!r}, whose free poses are of no pool, but "
             f"pool.kind is {kind!r}: give candidates.source 'dataset', or pool.kind 'even'"
+        )
+
+
+def _check_scene(values: dict, name: str) -> None:
+    """Raises ConfigError for a procedural scene that there is not, and where cameras cannot go."""
+    loader, scene, source = (values[o] for o in ("loader", "scene", "candidates.source"))
+    if loader != "procedural":
+        if source == "free":
+            raise ConfigError(
+                f"{name}.candidates.source: is 'free', which takes pictures on the way, and "
+                f"{name}.loader is {shown(loader)}; give 'dataset', 'hemisphere', or the loader "
+                "'procedural'"
+            )
+    elif scene not in SUBJECTS:
+        known = ", ".join(map(repr, SUBJECTS))
+        raise ConfigError(f"{name}.scene: is {shown(scene)}; the loader has {known}: give one")
+    elif source == "hemisphere" and SUBJECTS[scene].closed:
+        raise ConfigError(
+            f"{name}.candidates.source: is 'hemisphere', which lies beyond the walls of {scene!r}; "
+            "give 'dataset' or 'free'"
         )
 
 

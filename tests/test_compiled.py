@@ -21,7 +21,7 @@ from bavs_jax.cameras import project
 from bavs_jax.fields import contraction, deformation, encodings, positional
 from bavs_jax.pixel_table import view_pixel_rays
 from bavs_jax.rendering import compositing, histograms, sampling
-from bavs_jax.scenes import procedural, sculpture, sdf, sdf_surface
+from bavs_jax.scenes import photographs, sculpture, sdf, sdf_surface
 from bavs_jax.selection.directional import same_side
 from bavs_jax.selection.distances import pairwise_distances
 from bavs_jax.selection.policies.distance import great_circle
@@ -116,7 +116,7 @@ def look_from_elsewhere(cameras, pixels):
 def cones(cameras, pixels):
     """As the procedural scene traces them: one camera a row."""
     each = cams.take(cameras, jnp.zeros(len(pixels), int))
-    _, directions, spread = procedural.pixel_cones(each, pixels)
+    _, directions, spread = photographs.pixel_cones(each, pixels)
     return jnp.stack([*directions, spread], axis=-1)
 
 
@@ -158,7 +158,7 @@ def interpolated(points, *, contracted):
 
 
 def by_components(fn):
-    return lambda *vectors: jnp.stack(fn(*(procedural.components(v) for v in vectors)), axis=-1)
+    return lambda *vectors: jnp.stack(fn(*(photographs.components(v) for v in vectors)), axis=-1)
 
 
 def surface(points):

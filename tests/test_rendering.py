@@ -24,6 +24,7 @@ from bavs_jax.rendering.occupancy import (
 from bavs_jax.rendering.packing import evaluate_all_passes, evaluate_one_pass
 from bavs_jax.rendering.render import Channel, render_rays
 from bavs_jax.rendering.sampling import (
+    box_interval,
     make_march_options,
     march,
     nth_hit,
@@ -138,6 +139,32 @@ def test_valid_slots_come_first_and_cover_what_is_occupied():
         np.testing.assert_array_equal(samples.thinned, counts > slots)
     # A thinned ray still stands for its whole way.
     np.testing.assert_allclose(full.deltas.sum(-1), thin.deltas.sum(-1), atol=1e-5)
+
+
+@pytest.mark.parametrize("slots", [48, 6])
+def test_rays_end_on_a_closed_box_whatever_is_occupied(slots):
+    """The last step is there and opaque in thin fog; all others are those of an open box."""
+    limits = {"near": 0.5, "far": 8.0, "num_steps": 48, "num_slots": slots}
+    shut, open_ = (make_march_options(BOX, **limits, closed=closed) for closed in (True, False))
+    rays = rays_through(jax.random.key(1), 40)
+    enter, leave = box_interval(rays, jnp.asarray(BOX), 0.5, 8.0)
+    for share in (0.0, 0.3, 1.0):
+        occupancy = random_occupancy(jax.random.key(0), share)
+        samples, before = march(rays, occupancy, shut), march(rays, occupancy, open_)
+        num = np.asarray(samples.sample_mask.sum(-1))
+        is_long = np.asarray(leave - enter) > 2.0 * shut.step_size
+        assert is_long.sum() > 30 and (num[is_long] > 0).all() and num.max() <= slots
+        last = np.asarray(samples.t_mids)[np.arange(40), np.maximum(num - 1, 0)]
+        steps_off = np.asarray(samples.thinned) * (-(-48 // slots)) + 1.0
+        gap = (np.asarray(leave) - last)[is_long]
+        assert gap.min() > -1e-5 and (gap <= shut.step_size * steps_off[is_long] + 1e-5).all()
+        thin = 0.3 / float(BOX[1][0] - BOX[0][0])
+        opacity = render_weights(jnp.full(samples.deltas.shape, thin), samples.deltas).sum(-1)
+        np.testing.assert_allclose(opacity[is_long], 1.0, atol=1e-5)
+        if slots == 48:  # no ray is thinned
+            both = np.asarray(before.sample_mask)
+            np.testing.assert_array_equal(before.t_mids[both], samples.t_mids[both])
+            assert (num - both.sum(-1) <= 1).all()
 
 
 def test_thinned_rays_look_everywhere_in_turn():

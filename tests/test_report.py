@@ -278,6 +278,21 @@ def test_projection_is_seen_from_above():
     np.testing.assert_allclose(points, np.sqrt(2.0) * np.eye(2), atol=1e-12)
 
 
+def test_cameras_within_a_scene_are_drawn_on_a_plan():
+    rng = np.random.default_rng(0)
+    around = rng.normal(size=(50, 3))
+    around *= rng.uniform(1.0, 2.9, (50, 1)) / np.linalg.norm(around, axis=-1, keepdims=True)
+    assert not camera_map.stand_within(around)
+    assert camera_map.stand_within(rng.uniform(-1.0, 1.0, (50, 3)))
+    # Up to a turn, distances on the plan are the level parts of distances.
+    up = np.array([1.0, 2.0, -2.0]) / 3.0
+    level = around - np.outer(around @ up, up)
+    apart, wanted = (
+        np.linalg.norm(x[:, None] - x, axis=-1) for x in (camera_map.plan(around, 5.0 * up), level)
+    )
+    np.testing.assert_allclose(apart, wanted, atol=1e-12)
+
+
 def test_choices_are_named_with_their_scores_and_what_the_run_knows_of_them(tmp_path):
     result = report_files.make_result("bavs", num_rounds=2)
     workdir = report_files.write_workdir(tmp_path, [result], arrays=False)

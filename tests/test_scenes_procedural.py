@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bavs_jax.cameras import Cameras, image_pixels, make_cameras, pixel_rays, take
-from bavs_jax.scenes import SceneError, load_procedural, procedural, sculpture, sdf
+from bavs_jax.scenes import SceneError, load_procedural, photographs, procedural, sculpture, sdf
 from tests.oracles_scenes import brute_force_depth, distances
 
 SIZE = 20  # pixels; images of these tests are small
@@ -18,7 +18,7 @@ NEAR, FAR = 2.0, 4.3  # scene units; around the object as seen from the cameras
 
 
 def some_cameras(num: int = 3) -> Cameras:
-    return procedural.hemisphere_cameras(jax.random.key(7), num, image_size=SIZE)
+    return procedural.draw_cameras(jax.random.key(7), num, image_size=SIZE)
 
 
 def surface_colour(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -79,7 +79,7 @@ def test_object_lies_within_its_ball_and_has_an_inside():
 
 def test_detail_is_uneven():
     """The carved side has much more texture than the smooth one, as selection needs it."""
-    cameras = procedural.hemisphere_cameras(jax.random.key(0), 24, image_size=32)
+    cameras = procedural.draw_cameras(jax.random.key(0), 24, image_size=32)
     pixels, _, _ = procedural.capture(cameras)
     grey = pixels.reshape(24, 32, 32, 3).mean(axis=-1)
     detail = np.abs(np.diff(grey, axis=1)).mean(axis=(1, 2))
@@ -154,7 +154,7 @@ def test_highlights_move_with_the_viewer():
 
 def test_captures_of_any_poses_agree_and_compile_nothing_new(captured):
     cameras, pixels, alpha, depth = captured
-    steps = procedural.compiled_steps()
+    steps = photographs.compiled_steps(procedural.subject("sculpture"))
     compiled = [step._cache_size() for step in steps]
     other_pixels, other_alpha, other_depth = procedural.capture(take(cameras, np.array([2, 0])))
     rows = SIZE**2

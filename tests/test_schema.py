@@ -204,6 +204,30 @@ def test_every_bad_size_of_the_benchmark_is_refused(name):
             check_sizes(with_value(name, value, default_sizes()))
 
 
+@pytest.mark.parametrize(
+    "values, message",
+    [
+        ({"scene": "lego"}, r"scene: is 'lego'; the loader has 'sculpture', 'interior': give one"),
+        (
+            {"scene": "interior", "candidates.source": "hemisphere"},
+            "source: is 'hemisphere', .* walls of 'interior'; give 'dataset' or 'free'",
+        ),
+        (
+            {"loader": "blender", "candidates.source": "free"},
+            "source: is 'free', .*loader is 'blender'; give 'dataset', 'hemisphere', or",
+        ),
+    ],
+)
+def test_scenes_and_candidates_that_do_not_go_together_are_refused(values, message):
+    config = base.get_config()
+    config.update_from_flattened_dict(values)
+    with pytest.raises(ConfigError, match=rf"^config\.\S*{message}"):
+        check_config(config)
+    config.update(loader="procedural", scene="interior")
+    config.candidates.source = "free"
+    assert check_config(config) is config
+
+
 # --- what depends on the scene, before anything is trained ---
 
 

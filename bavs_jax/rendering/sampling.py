@@ -114,10 +114,19 @@ class MarchOptions(struct.PyTreeNode):
     step_size: float = struct.field(pytree_node=False)  # spacing, scene units
     num_steps: int = struct.field(pytree_node=False)  # most steps of a ray
     num_slots: int = struct.field(pytree_node=False)  # S, most samples of a ray
+    last_length: float | None = struct.field(pytree_node=False, default=None)  # see `march`
 
 
-def make_march_options(box, *, near, far, num_steps: int, num_slots: int) -> MarchOptions:
-    """Steps of one `num_steps`-th of the box's diagonal, so that any ray through it is covered."""
+CLOSED_LENGTH = 1e3  # diagonals of a closed box that the last sample of a ray stands for
+
+
+def make_march_options(
+    box, *, near, far, num_steps: int, num_slots: int, closed: bool = False
+) -> MarchOptions:
+    """Steps of one `num_steps`-th of the box's diagonal, so that any ray through it is covered.
+
+    In a `closed` box each ray's last sample stands for so much that even thin fog is opaque there.
+    """
     diagonal = float(np.linalg.norm(np.asarray(box)[1] - np.asarray(box)[0]))
     return MarchOptions(
         near=float(near),
@@ -125,6 +134,7 @@ def make_march_options(box, *, near, far, num_steps: int, num_slots: int) -> Mar
         step_size=diagonal / num_steps,
         num_steps=num_steps,
         num_slots=num_slots,
+        last_length=CLOSED_LENGTH * diagonal if closed else None,
     )
 
 
@@ -151,6 +161,11 @@ def march(
     their length, so its whole way is still integrated, more coarsely; such rays are marked in
     `thinned`.
 
+    With `options.last_length` the box is closed: each ray's last step in it is kept, whatever its
+    cell holds, and stands for that length, scene units, so that no light passes. A young field then
+    shows each ray's end on the box, where it soon looks like the walls. Fog that must hide a
+    background of another colour would come first, and stay.
+
     Args:
       rays: R rays.
       occupancy: the grid, whose box bounds the way.
@@ -164,7 +179,10 @@ def march(
     t = t_enter[:, None] + (jnp.arange(options.num_steps) + place[:, None]) * step_size
     positions = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
     cell = cell_index(occupancy, positions)
-    hit = occupancy.occupied.at[cell].get(mode="promise_in_bounds") & (t < t_leave[:, None])
+    is_within = t < t_leave[:, None]
+    hit = occupancy.occupied.at[cell].get(mode="promise_in_bounds") & is_within
+    if options.last_length is not None:
+        hit |= is_within & (t + step_size >= t_leave[:, None])
 
     hits = pack_hits(hit)
     total = hits.total
@@ -179,6 +197,9 @@ def march(
     step = nth_hit(hits, begin + nth)
     t_mids = t_enter[:, None] + (step + along - nth) * step_size
     deltas = step_size * group
+    if options.last_length is not None:
+        is_last = jnp.arange(num_slots) == sample_mask.sum(-1, keepdims=True) - 1
+        deltas = jnp.where(is_last, options.last_length, deltas)
     return Samples(
         t_mids=jnp.where(sample_mask, t_mids, options.far),
         deltas=deltas,

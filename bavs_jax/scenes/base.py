@@ -52,6 +52,7 @@ class Scene:
     alpha: np.ndarray | None = None  # [N] uint8 opacity of the photos; None: all opaque
     start: np.ndarray | None = None  # [S] int32 views of the pool that runs begin with; None: any
     unbounded: bool = False  # content reaches beyond the box, as in most real captures
+    closed: bool = False  # each ray from a camera ends on a surface within the box, as in a room
     photo_sizes: np.ndarray | None = None  # [V, 2] int32 pixels of the files; None: not reduced
     # [4, 4] float64 similarity from scene coordinates to those of the user's own file.
     user_from_scene: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(4))

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from bavs_jax.scenes import sdf
 from bavs_jax.scenes.sdf import Point
+from bavs_jax.scenes.shading import Colour, mirrored, mix, nearest_paint, openness, stacked
 
 SCENE_RADIUS = 0.99  # scene units; a ball around the origin that holds the object
 
@@ -96,16 +97,6 @@ def signed_distance(points: jax.Array) -> jax.Array:
 # --- paint and light -------------------------------------------------------------------------
 
 
-Number = jax.Array | float
-Colour = tuple[Number, Number, Number]  # sRGB components, one number for all points or an array
-
-
-def mix(a: Colour, b: Colour, share: jax.Array) -> Point:
-    """Colour between `a` (share 0) and `b` (share 1)."""
-    red, green, blue = (x + (y - x) * share for x, y in zip(a, b))
-    return red, green, blue
-
-
 def rainbow(phase: jax.Array) -> Point:
     """A saturated colour from a phase with period 1."""
     shifts = (0.0, 0.35, 0.7)
@@ -151,41 +142,20 @@ def paint(q: Point) -> tuple[Colour, jax.Array]:
     """Albedo (sRGB components) and strength of the highlight, in the tower's frame."""
     colours: list[Colour] = [paint_plinth(q), paint_tower(q), paint_hook(q), PURPLE, CYAN, GOLD]
     gloss = [0.05, 0.25, 0.35, 0.6, 0.6, 0.7]
-    nearest, shine = jnp.full_like(q[0], jnp.inf), jnp.zeros_like(q[0])
-    albedo: Colour = CREAM
-    for part, colour, strength in zip(part_distances(q), colours, gloss):
-        closer = part < nearest
-        red, green, blue = (jnp.where(closer, c, a) for c, a in zip(colour, albedo))
-        albedo = red, green, blue
-        shine = jnp.where(closer, strength, shine)
-        nearest = jnp.minimum(nearest, part)
-    return albedo, shine
-
-
-def occlusion(p: Point, normal: Point) -> jax.Array:
-    """How open the surface is to the sky, in [0, 1]: compares distances along the normal."""
-    reach, weight = jnp.array([0.04, 0.12, 0.28]), jnp.array([3.0, 1.5, 0.8])
-
-    def add(i, closed):
-        return closed + weight[i] * (reach[i] - distance(sdf.at(p, normal, reach[i])))
-
-    closed = jax.lax.fori_loop(0, reach.shape[0], add, jnp.zeros_like(p[0]))
-    return jnp.clip(1.0 - closed, 0.25, 1.0)
+    return nearest_paint(part_distances(q), colours, gloss)
 
 
 def shade(p: Point, directions: Point) -> Point:
     """Colour of surface points seen along `directions`: Lambert, sky, and a Phong highlight."""
     albedo, shine = paint(to_tower(p))
     normal = sdf.normals(distance, p)
-    openness = occlusion(p, normal)
+    open_share = openness(distance, p, normal)
     facing = sum(n * s for n, s in zip(normal, SUN))
     diffuse = jnp.maximum(facing, 0.0)
-    # Reflect the view direction at the surface and compare with the sun.
-    along = sum(d * n for d, n in zip(directions, normal))
-    mirror = sum((d - 2.0 * along * n) * s for d, n, s in zip(directions, normal, SUN))
-    highlight = shine * jnp.maximum(mirror, 0.0) ** 20 * (facing > 0.0)
-    light = openness * (0.62 + 0.10 * normal[2] + 0.45 * diffuse)
-    red, green, blue = (jnp.clip(a * light + highlight * openness, 0.0, 1.0) for a in albedo)
+    mirror = jnp.maximum(mirrored(directions, normal, SUN), 0.0)
+    highlight = shine * mirror**20 * (facing > 0.0)
+    light = open_share * (0.62 + 0.10 * normal[2] + 0.45 * diffuse)
+    red, green, blue = (jnp.clip(a * light + highlight * open_share, 0.0, 1.0) for a in albedo)
     return red, green, blue
 
 
@@ -196,6 +166,4 @@ def surface_colour(points: jax.Array, directions: jax.Array) -> jax.Array:
       points: [..., 3] on the surface, scene units.
       directions: [..., 3] unit, from the viewer to the point.
     """
-    p = points[..., 0], points[..., 1], points[..., 2]
-    d = directions[..., 0], directions[..., 1], directions[..., 2]
-    return jnp.stack(jnp.broadcast_arrays(*shade(p, d)), axis=-1)
+    return stacked(shade, points, directions)

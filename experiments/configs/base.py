@@ -10,7 +10,7 @@ def get_config() -> ConfigDict:
     # --- the scene ---
     config.loader = "procedural"  # a key of bavs_jax.scenes.LOADERS
     config.data_dir = placeholder(str)  # folder of scenes; None: $BAVS_DATA/<loader>
-    config.scene = "sculpture"  # folder in data_dir (the procedural scene has just this one)
+    config.scene = "sculpture"  # folder in data_dir; of "procedural": "sculpture" or "interior"
     config.image_size = 100  # pixels of the image width; 0: as the files are
 
     # --- how its files are read (bavs_jax/scenes); None: as the loader sees fit ---
@@ -65,7 +65,8 @@ def get_config() -> ConfigDict:
     config.hash_grid.log2_table_size = 16
     config.hash_grid.width = 64
     config.hash_grid.geometry_features = 15
-    config.hash_grid.initial_optical_depth = 0.3  # of a side of the scene box, before training
+    # Of a side of the scene box, before training; in a room that cameras stand in a 15th of it.
+    config.hash_grid.initial_optical_depth = 0.3
     config.hash_grid.direction_degree = 2  # spherical-harmonics bands, 1 .. 4
     config.hash_grid.appearance_features = 0  # of a code for each view trained on; 0: none
 
@@ -173,8 +174,9 @@ def get_config() -> ConfigDict:
 
     # --- candidates (bavs_jax/candidates.py, bavs_jax/selection) ---
     config.candidates = ConfigDict()
-    config.candidates.source = "dataset"  # "dataset" or "hemisphere" (Eq 14)
-    config.candidates.hemisphere_draws = 100
+    # "dataset", "hemisphere" (Eq 14), or "free": as the views of a procedural scene are drawn.
+    config.candidates.source = "dataset"
+    config.candidates.hemisphere_draws = 100  # poses drawn each round, unless from the dataset
     config.candidates.image_scale = 0.25  # of width and height, for the score (Eq 15)
     config.candidates.mode = placeholder(str)  # "top_k", "greedy"; None: the policy's own
     config.candidates.survivors = 0.17  # share that the max-min distance filter leaves (Fig 5)

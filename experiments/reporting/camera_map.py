@@ -18,6 +18,7 @@ from experiments.reporting.pictures import colour_bar
 SCORE_MAP = "viridis"
 COLOURS = colormaps[SCORE_MAP].with_extremes(bad="#b6bcc6")  # of a candidate without a score
 COLUMNS = 4
+WITHIN = 1.0 / 3.0  # of the median distance from the centre; on an orbit all are about as far
 
 
 def equal_area(directions: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -35,13 +36,31 @@ def equal_area(directions: np.ndarray, up: np.ndarray) -> np.ndarray:
       world's x, or z where `up` is along x.
     """
     up = np.asarray(up, float) / np.linalg.norm(up)
-    right = np.array([0.0, 0.0, 1.0] if abs(up[0]) > 0.9 else [1.0, 0.0, 0.0])
-    right = right - (right @ up) * up
-    right = right / np.linalg.norm(right)
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     # 2 sin(theta / 2) / sin(theta), which is not known at the nadir itself
     scale = np.sqrt(2.0 / np.maximum(1.0 + unit @ up, 1e-12))
-    return scale[:, None] * (unit @ np.stack([right, np.cross(up, right)], axis=-1))
+    return scale[:, None] * plan(unit, up)
+
+
+def plan(offsets: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Places as on a floor plan, [N, 2] to the right and to the top, axes as of `equal_area`.
+
+    Args:
+      offsets: [N, 3] from the scene's centre, any unit.
+      up: [3] towards who looks down.
+    """
+    up = np.asarray(up, float) / np.linalg.norm(up)
+    right = np.array([0.0, 0.0, 1.0] if abs(up[0]) > 0.9 else [1.0, 0.0, 0.0])
+    right = right - (right @ up) * up
+    right = right / np.linalg.norm(right)
+    return offsets @ np.stack([right, np.cross(up, right)], axis=-1)
+
+
+def stand_within(offsets: np.ndarray) -> bool:
+    """Whether some cameras [N, 3] are much nearer to the centre than most: then their directions
+    from it say little of where they are."""
+    distances = np.linalg.norm(offsets, axis=-1)
+    return bool(distances.min() < WITHIN * np.median(distances))
 
 
 def map_plot(acquisition: dict[str, np.ndarray], *, salt: str) -> Markup:
@@ -54,7 +73,8 @@ def map_plot(acquisition: dict[str, np.ndarray], *, salt: str) -> Markup:
     offsets = acquisition["positions"].astype(float) - acquisition["centre"]
     # A camera in the very centre has no direction; it is drawn at the pole.
     offsets[np.linalg.norm(offsets, axis=-1) == 0.0] = acquisition["up"]
-    points = equal_area(offsets, acquisition["up"])
+    is_within = stand_within(offsets)
+    points = (plan if is_within else equal_area)(offsets, acquisition["up"])
     pool, initial = (acquisition[name].astype(int) for name in ("pool", "initial"))
     chosen = [row[row >= 0] for row in acquisition["selected"]]  # -1 fills a round of fewer
     known = acquisition["scores"][np.isfinite(acquisition["scores"])]
@@ -64,7 +84,9 @@ def map_plot(acquisition: dict[str, np.ndarray], *, salt: str) -> Markup:
     grid = figure.add_gridspec(math.ceil(num / COLUMNS), min(num, COLUMNS))
     panels = [figure.add_subplot(grid[divmod(i, COLUMNS)]) for i in range(num)]
     for i, axes in enumerate(panels):
-        _draw_sky(axes, points[np.union1d(pool, initial)])
+        _set_limits(axes, points[np.union1d(pool, initial)])
+        if not is_within:
+            _draw_sky(axes)
         axes.set_title(f"Round {i + 1}" if chosen else "Initial views", fontsize=10)
         look = {"marker": "^", "edgecolors": "white", "zorder": 5, "label": "initial view"}
         axes.scatter(*points[initial].T, 34, "black", **look)
@@ -95,12 +117,16 @@ def map_plot(acquisition: dict[str, np.ndarray], *, salt: str) -> Markup:
     return plots.to_svg(figure, salt=salt, label="Map of cameras from above, one per round")
 
 
-def _draw_sky(axes: Axes, shown: np.ndarray) -> None:
-    """Circles of equal elevation, 60, 30 and 0 degrees, and limits that hold every camera."""
+def _draw_sky(axes: Axes) -> None:
+    """Circles of equal elevation, 60, 30 and 0 degrees."""
     for elevation in (60, 30, 0):
         radius = 2.0 * math.sin(math.radians(90 - elevation) / 2.0)
         edge = {"linewidth": 0.6 if elevation else 1.2, "edgecolor": plots.PALE, "zorder": 0}
         axes.add_patch(Circle((0, 0), radius, facecolor="none", **edge))
+
+
+def _set_limits(axes: Axes, shown: np.ndarray) -> None:
+    """Limits that hold every camera, one scale for both axes."""
     low, high = shown.min(axis=0), shown.max(axis=0)
     middle, half = (low + high) / 2.0, 0.6 * max((high - low).max(), 0.1)
     axes.set_xlim(middle[0] - half, middle[0] + half)
