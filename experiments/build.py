@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
+from bavs_jax import pools
 from bavs_jax.active import Acquisition, ActiveState
 from bavs_jax.candidates import (
     captured_candidates,
@@ -24,7 +25,7 @@ from bavs_jax.metrics.perceptual import make_lpips_fn
 from bavs_jax.models.base import RadianceModel
 from bavs_jax.pixel_table import make_pixel_table, num_training_pixels
 from bavs_jax.policy_inputs import InputMaker, LookOptions
-from bavs_jax.scenes import Scene, SceneError, load_scene, pools
+from bavs_jax.scenes import Scene, SceneError, load_scene
 from bavs_jax.scenes.procedural import capture, subject
 from bavs_jax.scenes.zoom import Zoom
 from bavs_jax.selection.distances import Radii

@@ -13,9 +13,9 @@ from ml_collections import ConfigDict
 
 from bavs_jax.metrics.ause import ERRORS, variant_name
 from bavs_jax.metrics.perceptual import NETS
+from bavs_jax.pools import KINDS as POOLS
 from bavs_jax.scenes import LOADERS
 from bavs_jax.scenes.lightfield import SPLITS
-from bavs_jax.scenes.pools import KINDS as POOLS
 from bavs_jax.scenes.procedural import SUBJECTS
 from bavs_jax.selection.policies import POLICIES
 from bavs_jax.selection.policy import MODES

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from bavs_jax import pools
 from bavs_jax.cameras import look_at, make_cameras
 from bavs_jax.candidates import captured_candidates, dataset_candidates, reachable_candidates
 from bavs_jax.pixel_table import make_pixel_table
-from bavs_jax.scenes import Scene, SceneError, pools
+from bavs_jax.scenes import Scene, SceneError
 from experiments.build import check_views, initial_views
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
@@ -189,6 +190,16 @@ def test_azimuths_are_those_of_the_angles_that_cameras_were_put_at():
     found = np.degrees(pools.elevations(scene, range(6)))
     wanted = [*np.degrees(np.arctan(flat[:, 2])), 90.0]
     np.testing.assert_allclose(found, wanted, atol=1e-4)
+
+
+def test_sides_are_those_of_what_cameras_look_at_wherever_the_box_is():
+    scene = dome()
+    moved = dataclasses.replace(scene, box=scene.box + np.float32([2.0, -1.0, 0.5]))
+    for seed in range(3):
+        found, wanted = (pools.unbalanced(s, share=0.75, seed=seed).pool for s in (moved, scene))
+        np.testing.assert_array_equal(found, wanted)
+        found, wanted = (pools.arc(s, degrees=60.0, seed=seed).start for s in (moved, scene))
+        np.testing.assert_array_equal(found, wanted)
 
 
 def test_an_arc_of_too_few_views_or_of_none_is_an_error():

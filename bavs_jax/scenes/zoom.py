@@ -41,11 +41,12 @@ def check_zoom(zoom: Zoom, reduction: float, width: int, path: pathlib.Path) -> 
     """
     if zoom.factor * reduction <= 1.0:
         return
-    wanted = int(width / zoom.factor)
-    fix = f"give an image_size of at most {wanted}, or a" if wanted else "give a"
+    smaller = int(width / zoom.factor)
+    fix = f"give an image_size of at most {smaller}, or a" if smaller else "give a"
     raise SceneError(
-        f"{path}: pool.factor: zoom by {zoom.factor:g} needs photos that much wider than what is "
-        f"trained on, but of {width} pixels {round(width * reduction)} are: {fix} smaller factor"
+        f"{path}: pool.factor: zoom by {zoom.factor:g} needs photos that many times as wide as "
+        f"image_size, but this is {round(width * reduction)} and they are {width} pixels wide: "
+        f"{fix} smaller factor"
     )
 
 

@@ -22,7 +22,7 @@ def get_config() -> ConfigDict:
     config.load.seed = 0  # draws the pool
     config.load.split = placeholder(str)  # of loader "lightfield"; see scenes/lightfield.py
 
-    # --- the pool: which views are on offer, and where a run begins (bavs_jax/scenes/pools.py) ---
+    # --- the pool: which views are on offer, and where a run begins (bavs_jax/pools.py) ---
     config.pool = ConfigDict()
     # "even": all of it. "unbalanced": most of it in one of three bands of elevation. "arc": runs
     # begin with views of one side. "reachable": the nearest to the view taken last, one in a round.

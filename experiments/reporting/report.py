@@ -6,7 +6,7 @@ import json
 import os
 from pathlib import Path
 
-from bavs_jax.scenes.pools import BANDS, crowded_band
+from bavs_jax.pools import BANDS, crowded_band
 from experiments.reporting import pictures, plots, results, run_tables, stats
 from experiments.reporting.camera_map import map_plot
 from experiments.reporting.page import FOLDER, write_template

@@ -1,12 +1,15 @@
 """Pools that people have: views crowded at one height, or a start from one side.
 
-The test views stay those of the scene: whatever the pool, all directions are asked for.
+The test views stay those of the scene: whatever the pool, all directions are asked for. Directions
+are seen from the scene's focus, the point that its cameras look at: the centre of an orbit around
+one object. The middle of a capture's box is where its cameras are, and says nothing of their sides.
 """
 
 import dataclasses
 
 import numpy as np
 
+from bavs_jax.placement.seen import focus_point
 from bavs_jax.scenes.base import Scene, SceneError
 
 KINDS = ("even", "unbalanced", "arc", "reachable", "zoom")
@@ -15,7 +18,7 @@ LEAST_SPREAD = 1e-3  # radians of elevation, and the sine of an angle to the ver
 
 
 def elevations(scene: Scene, view_ids) -> np.ndarray:
-    """Angles [n] of cameras above the horizon of the scene's centre, radians in float64."""
+    """Angles [n] of cameras above the horizon of the scene's focus, radians in float64."""
     across, above = _across_and_above(scene, view_ids)
     return np.arctan2(above, np.linalg.norm(across, axis=-1))
 
@@ -23,7 +26,7 @@ def elevations(scene: Scene, view_ids) -> np.ndarray:
 def azimuths(scene: Scene, view_ids, reference: int) -> np.ndarray:
     """Angles [n] around `up` from one camera to others, radians in [-pi, pi], float64.
 
-    NaN for a camera that is straight above or below the scene's centre, or the reference is.
+    NaN for a camera that is straight above or below the scene's focus, or the reference is.
     """
     across, above = _across_and_above(scene, [reference, *view_ids])
     length = np.linalg.norm(across, axis=-1)
@@ -41,7 +44,7 @@ def crowded_band(seed: int) -> int:
 def unbalanced(scene: Scene, *, share: float, seed: int) -> Scene:
     """A scene whose pool is thinned until most of it lies in one of three bands of elevation.
 
-    Elevation is measured from the scene's centre by its `up`. Sorted by it, the pool is cut into
+    Elevation is measured from the scene's focus by its `up`. Sorted by it, the pool is cut into
     three bands of equally many views, which on an even hemisphere are of equal area. The seed draws
     which band is crowded, and which views stay: as many as leave `share` of the pool in that band
     and half of the rest in each other one. That is 40 of 100 views for a share of 0.75, the setting
@@ -79,7 +82,7 @@ def arc(scene: Scene, *, degrees: float, seed: int) -> Scene:
     """A scene in which runs begin with views of one side; candidates are everywhere.
 
     The seed draws a view of the pool. Runs begin with views whose azimuth around `up`, seen from
-    the scene's centre, is within `degrees / 2` of that view's, so that no two are more than
+    the scene's focus, is within `degrees / 2` of that view's, so that no two are more than
     `degrees` apart. Views straight above or below have no azimuth and are not among them.
 
     Args:
@@ -101,8 +104,9 @@ def arc(scene: Scene, *, degrees: float, seed: int) -> Scene:
 
 
 def _across_and_above(scene: Scene, view_ids) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets of cameras from the scene's centre, along the horizon [n, 3] and along `up` [n]."""
+    """Offsets of cameras from the scene's focus, along the horizon [n, 3] and along `up` [n]."""
     positions = np.asarray(scene.cameras.positions, np.float64)[np.asarray(view_ids, int)]
-    offsets, up = positions - scene.centre, np.asarray(scene.up, np.float64)
+    focus = focus_point(scene.cameras.world_from_cam, scene.centre)
+    offsets, up = positions - focus, np.asarray(scene.up, np.float64)
     above = offsets @ up
     return offsets - above[:, None] * up, above
