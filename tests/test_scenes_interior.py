@@ -265,7 +265,7 @@ def test_an_unknown_scene_is_refused_with_those_that_there_are(name):
 
 
 def test_a_run_with_free_poses_ends_with_its_page(tmp_path):
-    options = {"candidates__source": "free", "candidates__hemisphere_draws": 6, "image_size": 8}
+    options = {"candidates__source": "free", "candidates__hemisphere_draws": 6, "image_size": 12}
     flags = toy_flags(scene="interior", policies="('bavs',)", **TINY, **options)
     done = script(f"--workdir={tmp_path}", *flags)
     assert done.returncode == 0, done.stderr
