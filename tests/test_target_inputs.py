@@ -97,7 +97,7 @@ def test_poses_of_a_file_are_in_the_user_s_coordinates(tmp_path):
     np.testing.assert_allclose(cameras.world_from_cam, poses, atol=1e-5)
     np.testing.assert_array_equal(cameras.sizes, [[8, 8], [8, 8]])
     path.write_text("{}")
-    with pytest.raises(SceneError, match="frames: missing"):
+    with pytest.raises(SceneError, match=r"config\.targets\.poses_file: .*frames: missing"):
         Problem(config, scene, track=silent)
 
 
