@@ -3,7 +3,7 @@
 import numpy as np
 
 from bavs_jax.candidates import candidate_cameras, scene_hemisphere
-from bavs_jax.scenes import Scene
+from bavs_jax.scenes import Scene, SceneError
 from bavs_jax.scenes.pose_files import read_pose_file
 from bavs_jax.scenes.poses import transform_poses
 from bavs_jax.target_inputs import MakeTargets
@@ -24,7 +24,10 @@ def build_targets(config, scene: Scene) -> MakeTargets:
         num = config.targets.num
         return lambda key: candidate_cameras(scene, scene_hemisphere(key, scene, num))
     if kind == "file":
-        poses = read_pose_file(config.targets.poses_file)
+        try:
+            poses = read_pose_file(config.targets.poses_file)
+        except SceneError as error:
+            raise SceneError(f"config.targets.poses_file: {error}") from error
         poses = transform_poses(np.linalg.inv(scene.user_from_scene), poses)
         cameras = candidate_cameras(scene, poses)
         return lambda key: cameras

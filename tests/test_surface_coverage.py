@@ -15,7 +15,11 @@ from bavs_jax.selection.context import make_context
 from bavs_jax.selection.distances import far_from_chosen
 from bavs_jax.selection.policies import POLICIES
 from bavs_jax.uncertainty.model import RECONSTRUCTION
-from bavs_jax.uncertainty.models.coverage import make_surface_fn
+from bavs_jax.uncertainty.models.coverage import (
+    Covered,
+    make_surface_coverage_fns,
+    make_surface_fn,
+)
 from bavs_jax.uncertainty.surface import (
     Lookers,
     cell_number,
@@ -182,8 +186,12 @@ def test_cells_are_between_their_vertices(contracted):
 # --- the gate ---
 
 
-def surface_of_ball(density):
-    """Centres of the cells that count as surface of a ball of radius 0.7, seen from +x alone."""
+# Looks at the ball from +x and, where it counts, from -x; its surface is 2.3 away.
+BALL_LOOKERS = lookers_at([[3.0, 0.0, 0.0], [-3.0, 0.0, 0.0]], 2.3, 1.0, np.array([True, False]))
+
+
+def ball_setup(density):
+    """A setup whose field is a ball of radius 0.7, and a state of training of it."""
     problem = Problem(toy_config(uncertainty__log2_cells=4), toy_scene(), track=silent)
 
     def ball(params, positions, directions):
@@ -198,9 +206,13 @@ def surface_of_ball(density):
         sampler=even_sampler(near=1.0, far=6.0, num=100),
     )
     setup = problem.setup._replace(models={RECONSTRUCTION: model})
-    lookers = lookers_at([[3.0, 0.0, 0.0], [-3.0, 0.0, 0.0]], 2.3, 1.0, np.array([True, False]))
-    train = dataclasses.replace(problem.trainer.init(jax.random.key(0)), model=NOTHING_LEARNT)
-    surface = make_surface_fn(setup)(train, lookers)
+    return setup, dataclasses.replace(problem.trainer.init(jax.random.key(0)), model=NOTHING_LEARNT)
+
+
+def surface_of_ball(density):
+    """Centres of the cells that count as surface where the ball is seen from +x alone."""
+    setup, train = ball_setup(density)
+    surface = make_surface_fn(setup)(train, BALL_LOOKERS)
     cells = np.stack(np.unravel_index(np.flatnonzero(surface.cells), (16, 16, 16)), -1)
     assert surface.cells.shape == (16**3,)
     return -1.0 + (cells + 0.5) / 8.0, surface.reference
@@ -219,6 +231,32 @@ def test_surface_is_where_a_training_view_meets_matter():
 def test_fog_has_no_surface():
     centres, _ = surface_of_ball(density=1.0)
     assert len(centres) == 0
+
+
+def test_what_a_ray_is_worth():
+    """Through the middle of the ball, from +x, from -x, and from +x twice as far away."""
+    setup, train = ball_setup(density=60.0)
+    surface = make_surface_fn(setup)(train, BALL_LOOKERS)._replace(reference=np.float32(2.3))
+    fns = make_surface_coverage_fns(setup)
+    rays = Rays(
+        np.float32([[3.0, 0.0, 0.0], [-3.0, 0.0, 0.0], [5.3, 0.0, 0.0], [5.3, 0.9, 0.9]]),
+        np.float32([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]),
+    )
+    way = 1.0 / np.sqrt(3.0)  # through the middle of the box, of its diagonal
+
+    def worth(mask):
+        covered = Covered(BALL_LOOKERS._replace(mask=np.array(mask)), surface)
+        return np.asarray(fns.render(covered, train, rays)["uncertainty"])
+
+    # Nobody looks: surface is new, and counts by distance; the rest of the box is unknown.
+    np.testing.assert_allclose(worth([False, False]), [1.0, way, 0.25, way], atol=0.03)
+    seen = worth([True, False])
+    np.testing.assert_allclose(seen[[0, 2]], 0.0, atol=0.03)  # known from there
+    # Surface of no training view is none; what is behind 2.3 / 0.95 from +x is unknown.
+    np.testing.assert_allclose(seen[1], way * (1.0 + 3.0 - 2.3 / 0.95) / 2.0, atol=0.03)
+    both = BALL_LOOKERS._replace(mask=np.array([True, True]))
+    surface = make_surface_fn(setup)(train, both)
+    assert (worth([True, True])[:3] < 0.03).all()
 
 
 # --- who is far enough ---

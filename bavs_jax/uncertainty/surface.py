@@ -4,9 +4,10 @@
 
 over points p of the surface on the rays of a view c: w is the rendering weight, d the direction to
 the point, s the views so far, `vis_s(p)` the transmittance to the point, and `g = min(1, (r_ref /
-r)^2)` of the distance r, so that what is far counts less. The surface is the cells whose weight was
-above a threshold in some training view: fog has none. A ray counts as far as it meets no surface by
-the share of its way through the box that no view has looked into.
+r)^2)` of the distance r, so that what is far counts less. The surface is the cells in which a
+sample of some view so far had a weight above a threshold: fog has none, and matter that a field
+made up where nobody looked is none either. As far as a ray meets no surface, it counts by the share
+of its way through the box that no view has looked into.
 
 After SBV, CONVERGE and AGILE; differs from `measures.direction_novelty`, which knows neither gate,
 distance nor unknown space.

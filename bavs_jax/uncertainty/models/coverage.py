@@ -39,10 +39,10 @@ class Covered(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """What the training views say of where the surface is."""
+    """What the views so far say of where the surface is, by the field as it is now."""
 
-    cells: Array  # [cells^3] bool
-    reference: Array  # [] r_ref, the median distance from which they look at it, scene units
+    cells: Array  # [cells^3] bool, of training views and picks
+    reference: Array  # [] r_ref, the median distance of training views from it, scene units
 
 
 # "uncertainty" [R] of what rays see, beside `basic_images`.
@@ -97,7 +97,11 @@ def make_covered_fns(setup: SceneSetup, images_fn: ImagesFn, *, find_surface=Fal
             depth_maps=before.depth_maps + more.depth_maps,
             opacity_maps=before.opacity_maps + more.opacity_maps,
         )
-        return covered._replace(lookers=lookers)
+        surface = covered.surface
+        if surface is not None:
+            seen = surface_of(train, more).cells
+            surface = surface._replace(cells=np.asarray(surface.cells) | np.asarray(seen))
+        return Covered(lookers, surface)
 
     def render(covered, train, rays):
         return compiled(train.model, covered, rays)
@@ -106,7 +110,7 @@ def make_covered_fns(setup: SceneSetup, images_fn: ImagesFn, *, find_surface=Fal
 
 
 def make_surface_fn(setup: SceneSetup) -> Callable[..., Surface]:
-    """Makes what finds the surface: (state of training, the training views) -> `Surface`."""
+    """Makes what finds the surface: (state of training, views) -> `Surface` of these views."""
     grid = setup.grid
 
     def surface_cells(state, rays):
@@ -155,7 +159,7 @@ def make_fns(setup: SceneSetup) -> ModelFns:
 
 
 def make_surface_coverage_fns(setup: SceneSetup) -> ModelFns:
-    """See `uncertainty/surface.py`; the surface is that of the training views alone."""
+    """See `uncertainty/surface.py`; what a pick meets is surface from then on."""
 
     def images(state, covered, rays):
         lookers, surface = covered.lookers, covered.surface
