@@ -368,7 +368,7 @@ def test_spread_without_any_view_begins_in_the_middle():
     [
         ("bavs_spread", "spread", "directional"),
         ("farthest_informative", "farthest", "directional"),
-        ("target_spread", "farthest", "target_information_log"),
+        ("target_spread", "spread", "target_information_log"),
     ],
 )
 def test_products_of_two_scores(name, first, second):

@@ -7,7 +7,7 @@ import numpy as np
 
 from bavs_jax.selection.context import require, score_candidates
 from bavs_jax.selection.directional import add_look
-from bavs_jax.selection.policies.distance import nearest_chosen
+from bavs_jax.selection.policies.distance import spread_score
 from bavs_jax.selection.policy import Policy
 from bavs_jax.selection.targets import TargetInformation, linear_gain, log_gain
 
@@ -25,12 +25,12 @@ def target_score(key, ctx, *, gain: TargetGain = log_gain):
 
 
 def target_spread_score(key, ctx):
-    """Distance to the nearest chosen view times `target_information_log`.
+    """`spread` times `target_information_log`.
 
     Ours. From few views the curvature is that of fog. Distance needs no field and leads then, as in
-    `farthest_informative`.
+    `bavs_spread`.
     """
-    return np.asarray(nearest_chosen(ctx)) * target_score(key, ctx)
+    return np.asarray(spread_score(key, ctx)) * target_score(key, ctx)
 
 
 TARGET_INFORMATION = Policy(
@@ -51,8 +51,7 @@ POLICIES = (
     ),
     TARGET_INFORMATION._replace(
         name="target_spread",
-        summary="Greedily the view of largest distance to the chosen ones times information about "
-        "target views.",
+        summary="Greedily the view of largest spread times information about target views.",
         score_fn=target_spread_score,
     ),
 )
