@@ -33,6 +33,7 @@ READS = {
     "sweep": ("--config={}/c.py", "c.py"),
     "tables": (None, "summary.json"),
     "time_to_quality": ("--config={}/c.py", "c.py"),
+    "view_sets": ("--runs={}", "summary.json"),
 }
 QUICK = ("active_selection", "report")
 
