@@ -16,6 +16,7 @@ TOLERANCE = 0.01  # of the box's diagonal, within which depths are of one surfac
 SLANT = 3.0  # and as many widths of a pixel more: a surface seen at 70 degrees
 PER_PLACE = 8  # points that a place of a depth buffer has in the mean, at least
 FOLDS = 10
+ROUNDING = 1e-5  # as share of the largest: cameras on a sphere are equally far
 
 
 class Surface(NamedTuple):
@@ -122,8 +123,8 @@ def describe(scene: Scene, views: np.ndarray, surface: Surface | None) -> dict[s
 
 
 def correlation(x: np.ndarray, y: np.ndarray) -> float | None:
-    """Spearman's rank correlation of [N] and [N]; None where either does not vary."""
-    if np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+    """Spearman's rank correlation of [N] and [N]; None where either varies by rounding alone."""
+    if any(np.ptp(values) <= ROUNDING * np.abs(values).max() for values in (x, y)):
         return None
     return float(spearmanr(x, y).statistic)
 
@@ -156,7 +157,7 @@ def fit_line(features: np.ndarray, target: np.ndarray):
     Features are put on one scale first; those that do not vary have no part in it.
     """
     mean, std = features.mean(axis=0), features.std(axis=0)
-    kept = std > 1e-9
+    kept = std > ROUNDING * np.abs(features).max(axis=0)
     scaled = (features[:, kept] - mean[kept]) / std[kept]
     weights, *_ = np.linalg.lstsq(scaled, target - target.mean(), rcond=None)
 

@@ -15,6 +15,7 @@ from experiments.reporting.tables import Cell, Collected, Table, dash, interval_
 FILE = "view_sets.json"
 RANDOM = "random"  # the policy whose sets the others are held against
 SHOWN = 4  # descriptors in the plot, the best ones
+FEW = "fewer than three random sets a descriptor"
 
 
 def sets_table(result: dict) -> Table:
@@ -37,7 +38,7 @@ def sets_table(result: dict) -> Table:
                 few if spread is None else f"{spread:.2f}",
                 unknown if noise is None else f"{noise:.2f}",
                 f"{max(psnr):.2f}" if len(psnr) else few,
-                dash("fewer than three sets a descriptor") if share is None else f"{share:.2f}",
+                dash(FEW) if share is None else f"{share:.2f}",
                 unknown if could is None else f"{could:.2f}",
             ]
         )
@@ -71,7 +72,7 @@ def policies_table(result: dict) -> Table | None:
                     policy,
                     interval_cell(stats.mean_interval(values), 2, ""),
                     Cell(f"{np.mean(below):.0%}") if below else dash(why),
-                    interval_cell(stats.mean_interval(predicted), 2, why),
+                    interval_cell(stats.mean_interval(predicted), 2, FEW),
                 ]
             )
     head = ("views", "policy", "PSNR (dB)", "random sets below it", "as its descriptors say (dB)")
@@ -109,16 +110,17 @@ def features_plot(result: dict) -> Markup | None:
     for group, line in zip(groups, panels):
         order = sorted(group["features"], key=lambda n: -abs(group["features"][n] or 0.0))
         policies = plots.by_interest({row["policy"] for row in group["rows"]})
-        style = plots.policy_style(policies)
+        style = plots.policy_style(policies[: plots.MANY])
         for name, axes in zip(order, line):
             for policy in policies:
                 mine = [row for row in group["rows"] if row["policy"] == policy]
-                colour, marker = style[policy]
+                colour, marker = style.get(policy, (plots.PALE, "."))
                 points = [(row["described"][name], row["psnr"]) for row in mine]
-                look = {"color": colour, "marker": marker, "alpha": 0.7, "label": policy}
+                look = {"color": colour, "marker": marker, "alpha": 0.7}
+                look["label"] = policy if policy in style else None
                 axes.scatter(*zip(*points), s=16, **look)
             axes.set_xlabel(name.replace("_", " "))
             axes.set_title(f"PSNR (dB), {group['num_views']} views")
             plots.tidy(axes)
-        line[0].legend(fontsize=8)
+        line[-1].legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return plots.to_svg(figure, salt="sets", label="PSNR against what sets are described by")
