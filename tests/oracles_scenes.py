@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.scenes import sculpture
+from bavs_jax.scenes.photographs import components
 
 
 def distances(
@@ -17,6 +18,12 @@ def distances(
     """A signed distance in float64, [...]; the sculpture's by default."""
     with jax.enable_x64(True):
         return np.asarray(jax.jit(signed_distance)(jnp.asarray(points, jnp.float64)))
+
+
+def surface_colour(shade: Callable, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """The scene's own colour, [..., 3], of points [..., 3] seen along unit directions [..., 3]."""
+    colour = jax.jit(shade)(components(points), components(directions))
+    return np.stack(np.broadcast_arrays(*colour), axis=-1)
 
 
 def brute_force_depth(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import jax
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from bavs_jax.cameras import image_pixels, pixel_rays, project, take
 from bavs_jax.placement.clearance import judge_positions
 from bavs_jax.scenes import SceneError, interior, load_procedural, procedural
-from tests.oracles_scenes import brute_force_depth, distances
+from tests.oracles_scenes import brute_force_depth, distances, surface_colour
 from tests.test_run import script
 from tests.toy_runs import TINY, toy_flags
 
@@ -138,7 +139,7 @@ def test_colour_is_the_mean_over_the_pixel(captured):
     chosen = np.random.default_rng(0).choice(SIZE**2, 60, replace=False)
     centres, ids = image_pixels(SIZE, SIZE)[chosen], np.zeros(len(chosen), int)
     total = np.zeros((len(chosen), 3))
-    colour_fn = jax.jit(interior.surface_colour)
+    colour_fn = partial(surface_colour, interior.shade)
     for offset in np.float32([(dx, dy) for dx in SUBPIXELS for dy in SUBPIXELS]):
         rays = pixel_rays(cameras, ids, centres + offset)
         origins, directions = (np.asarray(a) for a in (rays.origins, rays.directions))
@@ -160,7 +161,7 @@ def test_highlights_move_with_the_viewer():
     np.testing.assert_allclose(room_distances(top), 0.0, atol=1e-6)
     aside = np.cross(towards_lamp, [0.0, 0.0, 1.0]) / np.linalg.norm(towards_lamp[:2])
     bright, dull = (
-        np.asarray(interior.surface_colour(top, np.float32([-look])))
+        surface_colour(interior.shade, top, np.float32([-look]))
         for look in (towards_lamp, 0.6 * towards_lamp + 0.8 * aside)
     )
     assert (bright - dull).max() > 0.1 and (bright >= dull).all()

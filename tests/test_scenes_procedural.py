@@ -11,7 +11,7 @@ import pytest
 
 from bavs_jax.cameras import Cameras, image_pixels, make_cameras, pixel_rays, take
 from bavs_jax.scenes import SceneError, load_procedural, photographs, procedural, sculpture, sdf
-from tests.oracles_scenes import brute_force_depth, distances
+from tests.oracles_scenes import brute_force_depth, distances, surface_colour
 
 SIZE = 20  # pixels; images of these tests are small
 NEAR, FAR = 2.0, 4.3  # scene units; around the object as seen from the cameras
@@ -19,10 +19,6 @@ NEAR, FAR = 2.0, 4.3  # scene units; around the object as seen from the cameras
 
 def some_cameras(num: int = 3) -> Cameras:
     return procedural.draw_cameras(jax.random.key(7), num, image_size=SIZE)
-
-
-def surface_colour(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    return np.asarray(jax.jit(sculpture.surface_colour)(points, directions))
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +117,9 @@ def test_colour_is_the_mean_over_the_pixel(captured):
             origins, directions = (np.asarray(a) for a in (rays.origins, rays.directions))
             depth, _ = brute_force_depth(origins, directions, near=NEAR, far=FAR, step=4e-3)
             points = origins + depth[:, None].astype(np.float32) * directions
-            total += np.where(depth[:, None] > 0.0, surface_colour(points, directions), 1.0)
+            total += np.where(
+                depth[:, None] > 0.0, surface_colour(sculpture.shade, points, directions), 1.0
+            )
     error = np.abs(pixels[chosen] - 255.0 * total / 9.0).max(axis=-1)
     # Half a step of rounding, and what 3e-4 of the surface's distance changes. At this size one ray
     # of nine may fall to the other side of an edge, up to 255 / 9: rare.
@@ -146,8 +144,8 @@ def test_highlights_move_with_the_viewer():
     top = [[cos * u - sin * v, sin * u + cos * v, w + ring + tube + sculpture.LIFT]]
     np.testing.assert_allclose(distances(np.array(top)), 0.0, atol=1e-6)
     towards_mirror = np.array([[-sculpture.SUN[0], -sculpture.SUN[1], sculpture.SUN[2]]])
-    bright = surface_colour(np.float32(top), -np.float32(towards_mirror))
-    dull = surface_colour(np.float32(top), np.float32([[0.0, 0.0, -1.0]]))
+    bright = surface_colour(sculpture.shade, np.float32(top), -np.float32(towards_mirror))
+    dull = surface_colour(sculpture.shade, np.float32(top), np.float32([[0.0, 0.0, -1.0]]))
     assert (bright - dull).max() > 0.2
     assert (bright >= dull).all()
 

@@ -15,7 +15,7 @@ import numpy as np
 from bavs_jax.cameras import look_at
 from bavs_jax.scenes import sdf
 from bavs_jax.scenes.sdf import Point
-from bavs_jax.scenes.shading import Colour, mirrored, mix, nearest_paint, openness, stacked
+from bavs_jax.scenes.shading import Colour, mirrored, mix, nearest_paint, openness
 
 # Shape; half sides, radii and places in scene units. The niche reaches into the room, so that its
 # opening is no surface.
@@ -179,16 +179,6 @@ def shade(p: Point, directions: Point) -> Point:
     light = open_share * (0.62 + 0.08 * normal[2] + 0.8 * bright * jnp.maximum(facing, 0.0))
     red, green, blue = (jnp.clip(a * light + highlight * open_share, 0.0, 1.0) for a in albedo)
     return red, green, blue
-
-
-def surface_colour(points: jax.Array, directions: jax.Array) -> jax.Array:
-    """Colour [..., 3] that leaves the surface to a viewer, with its view-dependent highlight.
-
-    Args:
-      points: [..., 3] on the surface, scene units.
-      directions: [..., 3] unit, from the viewer to the point.
-    """
-    return stacked(shade, points, directions)
 
 
 # --- cameras ---------------------------------------------------------------------------------

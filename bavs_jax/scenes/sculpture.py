@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from bavs_jax.scenes import sdf
 from bavs_jax.scenes.sdf import Point
-from bavs_jax.scenes.shading import Colour, mirrored, mix, nearest_paint, openness, stacked
+from bavs_jax.scenes.shading import Colour, mirrored, mix, nearest_paint, openness
 
 SCENE_RADIUS = 0.99  # scene units; a ball around the origin that holds the object
 
@@ -157,13 +157,3 @@ def shade(p: Point, directions: Point) -> Point:
     light = open_share * (0.62 + 0.10 * normal[2] + 0.45 * diffuse)
     red, green, blue = (jnp.clip(a * light + highlight * open_share, 0.0, 1.0) for a in albedo)
     return red, green, blue
-
-
-def surface_colour(points: jax.Array, directions: jax.Array) -> jax.Array:
-    """Colour [..., 3] that leaves the surface to a viewer, with its view-dependent highlight.
-
-    Args:
-      points: [..., 3] on the surface, scene units.
-      directions: [..., 3] unit, from the viewer to the point.
-    """
-    return stacked(shade, points, directions)

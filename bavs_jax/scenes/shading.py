@@ -1,6 +1,6 @@
 """Paint and light on the surface of a signed distance field, as pure functions of components."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -53,11 +53,3 @@ def mirrored(directions: Point, normal: Point, to_light: Point | Colour) -> jax.
     along = directions[0] * normal[0] + directions[1] * normal[1] + directions[2] * normal[2]
     x, y, z = ((d - 2.0 * along * n) * s for d, n, s in zip(directions, normal, to_light))
     return x + y + z
-
-
-def stacked(
-    shade: Callable[[Point, Point], Point], points: jax.Array, directions: jax.Array
-) -> jax.Array:
-    """What a function of components gives for points and directions [..., 3], as [..., 3]."""
-    p, d = ((a[..., 0], a[..., 1], a[..., 2]) for a in (points, directions))
-    return jnp.stack(jnp.broadcast_arrays(*shade(p, d)), axis=-1)
