@@ -101,6 +101,13 @@ class TrainedRun(NamedTuple):
 # --- which run -------------------------------------------------------------------------------
 
 
+def renewed_config(saved: dict) -> ConfigDict:
+    """A config that was saved, unchecked; options that it did not know have their default."""
+    config = base.get_config().lock()
+    config.update(modern(saved))
+    return config
+
+
 def saved_config(workdir: pathlib.Path) -> ConfigDict:
     """The config that a run left in its folder; options that it did not know have their default.
 
@@ -108,9 +115,8 @@ def saved_config(workdir: pathlib.Path) -> ConfigDict:
       WorkdirError: there is none, or one that this version cannot read.
     """
     path = workdir / "config.json"
-    config = base.get_config().lock()
     try:
-        config.update(modern(json.loads(path.read_text(encoding="utf-8"))))
+        config = renewed_config(json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError as error:
         raise WorkdirError(
             f"{path}: does not exist: give the --workdir of a run, or a --config to start one"

@@ -23,8 +23,7 @@ from ml_collections import ConfigDict
 from bavs_jax.metrics.view_sets import correlation, describe, explained, fit_line, visible_surface
 from experiments import runtime
 from experiments.build import initial_views, load_config_scene
-from experiments.configs import base
-from experiments.files import leaves, modern, write_json
+from experiments.files import leaves, write_json
 from experiments.reporting import stats
 from experiments.reporting.page import Section, write_page
 from experiments.reporting.results import Run, load_runs
@@ -32,6 +31,7 @@ from experiments.reporting.tables import collected_text
 from experiments.reporting.view_sets import FILE, RANDOM, features_plot, view_set_tables
 from experiments.runtime import ReportError
 from experiments.schema import check_config
+from experiments.trained import renewed_config
 
 # Options that runs must share, or their numbers cannot be compared.
 ALIKE = (
@@ -53,8 +53,8 @@ flags.DEFINE_multi_string("runs", [], "Folder of an experiment or a sweep; may b
 flags.DEFINE_string("data_dir", "", "Folder of scenes, if it has moved since the runs.")
 
 
-def find_runs(folders: list[str]) -> list[Run]:
-    """All finished runs below some folders.
+def find_runs(folders: list[str]) -> list[tuple[Run, ConfigDict]]:
+    """All finished runs below some folders, each with its config.
 
     Raises:
       ReportError: a folder has none, or they are not of one scene, trained in one way.
@@ -66,28 +66,27 @@ def find_runs(folders: list[str]) -> list[Run]:
         if not found:
             raise ReportError(f"--runs: {folder} holds no finished run; give other folders")
         runs += found
-    first, *others = (leaves(run_config(run)) for run in runs)
-    for run, options in zip(runs[1:], others):
-        for name, value in options.items():
+    configs = [run_config(run) for run in runs]
+    first = leaves(configs[0])
+    for run, config in zip(runs[1:], configs[1:]):
+        for name, value in leaves(config).items():
             if name.startswith(ALIKE) and value != first[name]:
                 raise ReportError(
                     f"--runs: {name} is {first[name]} in {runs[0].folder}, but {value} in "
                     f"{run.folder}; give runs of one scene that were trained in one way"
                 )
-    return runs
+    return list(zip(runs, configs))
 
 
 def run_config(run: Run) -> ConfigDict:
     """The config that a run was made with; options that it did not know have their default."""
-    config = base.get_config().lock()
-    config.update(modern(run.result["config"]))
+    config = renewed_config(run.result["config"])
     config.data_dir = FLAGS.data_dir or config.data_dir
     return check_config(config)
 
 
-def trained_views(scene, run: Run) -> np.ndarray:
+def trained_views(scene, run: Run, config: ConfigDict) -> np.ndarray:
     """The views that the field of a run's last round was trained on, sorted."""
-    config = run_config(run)
     seed = run.seed if config.view_seed is None else config.view_seed
     views = set(initial_views(scene, seed, config.num_initial).tolist())
     for row in run.rounds[1:]:  # the first holds what the run began with
@@ -97,11 +96,11 @@ def trained_views(scene, run: Run) -> np.ndarray:
     return np.array(sorted(views))
 
 
-def measure_sets(scene, runs: list[Run]) -> list[dict]:
+def measure_sets(scene, runs: list[tuple[Run, ConfigDict]]) -> list[dict]:
     """By number of views: what runs were trained on, what that is described by, and their PSNR."""
     surface, by_number = visible_surface(scene), {}
-    for run in runs:
-        views = trained_views(scene, run)
+    for run, config in runs:
+        views = trained_views(scene, run, config)
         row = {"policy": run.policy, "seed": run.seed, "views": views.tolist()}
         row |= {"psnr": run.rounds[-1]["psnr"], "described": describe(scene, views, surface)}
         by_number.setdefault(len(views), []).append(row)
@@ -120,10 +119,11 @@ def summarise(rows: list[dict]) -> dict:
     # A set that was trained on several times counts once.
     by_set = {tuple(row["views"]): row for row in rows if row["policy"] == RANDOM}
     sets = [{**row, "psnr": float(np.mean(same[views]))} for views, row in by_set.items()]
-    found = {"rows": rows, "num_sets": len(sets), "noise": noise, "features": {}, "explained": None}
+    psnr = np.array([row["psnr"] for row in sets])
+    found = {"rows": rows, "num_sets": len(sets), "random_psnr": psnr.tolist(), "noise": noise}
+    found |= {"features": {}, "explained": None}
     if not sets:
         return found
-    psnr = np.array([row["psnr"] for row in sets])
     names = list(sets[0]["described"])
     features = np.array([[row["described"][name] for name in names] for row in sets])
     found["features"] = {n: correlation(features[:, i], psnr) for i, n in enumerate(names)}
@@ -142,12 +142,11 @@ def main() -> None:
         raise ReportError("--runs: give a folder of finished runs")
     runtime.start_cache()
     runs = find_runs(FLAGS.runs)
-    config = run_config(runs[0])
-    scene = load_config_scene(config, cache_dir=runtime.scene_cache())
+    scene = load_config_scene(runs[0][1], cache_dir=runtime.scene_cache())
     result = {
         "schema_version": 1,
         "scene": scene.name,
-        "device": runs[0].result["device"],
+        "device": runs[0][0].result["device"],
         "command": runtime.command_line(),
         "versions": runtime.versions(),
         "numbers": measure_sets(scene, runs),

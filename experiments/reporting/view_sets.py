@@ -24,7 +24,7 @@ def sets_table(result: dict) -> Table:
     head += ("explained by all descriptors (R²)", "could be explained")
     rows = []
     for group in result["numbers"]:
-        psnr, noise = random_psnr(group), group["noise"]
+        psnr, noise = group["random_psnr"], group["noise"]
         few = dash("fewer than two sets")
         spread = float(np.std(psnr, ddof=1)) if len(psnr) > 1 else None
         unknown = dash("no set was trained on twice")
@@ -45,21 +45,12 @@ def sets_table(result: dict) -> Table:
     return Table(head, rows)
 
 
-def random_psnr(group: dict) -> list[float]:
-    """PSNR of each random set of a group, its mean where it was trained on several times."""
-    same: dict[tuple, list[float]] = {}
-    for row in group["rows"]:
-        if row["policy"] == RANDOM:
-            same.setdefault(tuple(row["views"]), []).append(row["psnr"])
-    return [float(np.mean(psnrs)) for psnrs in same.values()]
-
-
 def policies_table(result: dict) -> Table | None:
     """Where the sets of other policies stand among the random ones; None without any."""
     rows = []
     for group in result["numbers"]:
         others = [row for row in group["rows"] if row["policy"] != RANDOM]
-        psnr = np.array(random_psnr(group))
+        psnr = np.array(group["random_psnr"])
         for policy in dict.fromkeys(row["policy"] for row in others):
             mine = [row for row in others if row["policy"] == policy]
             values = [row["psnr"] for row in mine]
