@@ -255,7 +255,7 @@ def check_config(config: ConfigDict, *more: str, name: str = "config") -> Config
             "or neither"
         )
     _check_scene(values, name)
-    check_pool(values, name)
+    _check_pool(values, name)
     if (values["targets.kind"] == "file") != bool(values["targets.poses_file"]):
         raise ConfigError(
             f"{name}.targets.poses_file: goes with {name}.targets.kind='file'; give both or neither"
@@ -263,7 +263,7 @@ def check_config(config: ConfigDict, *more: str, name: str = "config") -> Config
     return config
 
 
-def check_pool(values: dict, name: str) -> None:
+def _check_pool(values: dict, name: str) -> None:
     """Raises ConfigError where the kind of pool does not go with the other options."""
     kind, batch = values["pool.kind"], values["batch_size"]
     if kind == "reachable" and values["num_rounds"] and batch != 1:

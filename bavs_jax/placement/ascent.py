@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from bavs_jax.arrays import Array
-from bavs_jax.cameras import Cameras
+from bavs_jax.cameras import Cameras, take
 from bavs_jax.placement.proposals import aim
 from bavs_jax.progress import Progress
 from bavs_jax.selection.context import Context, mark_picked
@@ -154,7 +154,7 @@ def policy_scores(
     def score_fn(number, chosen, trials):
         others = np.delete(chosen, number, axis=0)
         poses = np.concatenate([cameras.world_from_cam, others, trials]).astype(np.float32)
-        like = jax.tree.map(lambda x: np.repeat(np.asarray(x)[:1], len(poses), axis=0), cameras)
+        like = take(jax.tree.map(np.asarray, cameras), np.zeros(len(poses), int))
         picked, mask = np.arange(len(poses)) >= len(cameras), np.zeros(len(poses), bool)
         mask[len(cameras) + len(others) :] = True
         context = context_fn(like.replace(world_from_cam=poses), mask)
