@@ -3,7 +3,7 @@
 import contextlib
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -30,8 +30,14 @@ from bavs_jax.selection.information import (
     make_cached_curvature_fn,
 )
 from bavs_jax.selection.policy import Policy
-from bavs_jax.target_inputs import MakeTargets, evenly_spaced_cameras, target_information
+from bavs_jax.target_inputs import (
+    MakeTargets,
+    evenly_spaced_cameras,
+    target_information,
+    view_gaps,
+)
 from bavs_jax.uncertainty.channel import mean_uncertainty
+from bavs_jax.uncertainty.images import make_image_fn
 from bavs_jax.uncertainty.measures import TrueErrorFn
 from bavs_jax.uncertainty.model import Acquired, ModelFns, SceneSetup
 from bavs_jax.uncertainty.models.laplace import training_curvature
@@ -100,6 +106,7 @@ class InputMaker:
             "information": self._information,
             "directional": self._directional,
             "targets": self._targets,
+            "gaps": self._gaps,
         }
         if self.true_error_fn is not None:
             makers["true_error_fn"] = partial(self._true_error, self.true_error_fn)
@@ -177,16 +184,12 @@ class InputMaker:
         look_fn = target_fn = make_look_fn(
             candidates.cameras, self._candidate_curvature(acquired, candidates, seconds)
         )
-        cameras, view_ids = self.make_targets(key), None
-        if cameras is None:
-            cameras = candidates.cameras if acquired.candidates is None else acquired.candidates
-            view_ids = candidates.view_ids[: len(cameras)]
+        cameras, rows = self._target_cameras(key, acquired, candidates)
         if cameras is not candidates.cameras:
             curvature_fn = self._candidate_curvature(
                 acquired, candidates._replace(cameras=cameras), seconds
             )
             target_fn = make_look_fn(cameras, curvature_fn)
-        rows = evenly_spaced_cameras(cameras.positions, options.num_targets, view_ids=view_ids)
         with _clock(seconds, "curvature"):
             return target_information(
                 self.setup,
@@ -197,6 +200,31 @@ class InputMaker:
                 take(cameras, rows),
                 max_bytes=options.cache_bytes,
             )
+
+    def _target_cameras(self, key, acquired, candidates):
+        """Cameras that may be asked about, and which of them [N] are."""
+        cameras, view_ids = self.make_targets(key), None
+        if cameras is None:
+            cameras = candidates.cameras if acquired.candidates is None else acquired.candidates
+            view_ids = candidates.view_ids[: len(cameras)]
+        num = self.options.num_targets
+        return cameras, evenly_spaced_cameras(cameras.positions, num, view_ids=view_ids)
+
+    def _gaps(self, policy, key, acquired, candidates, seconds):
+        cameras, rows = self._target_cameras(key, acquired, candidates)
+        with _clock(seconds, "score"):
+            return view_gaps(
+                partial(self._plain_images, acquired.train),
+                acquired,
+                candidates.cameras,
+                take(cameras, rows),
+                image_scale=self.options.image_scale,
+                chunk=self.options.chunk,
+            )
+
+    @cached_property
+    def _plain_images(self):
+        return make_image_fn(self.setup, self.setup.kind)
 
     def _training_looks(self, acquired):
         make = partial(training_looks, self.setup, acquired, self.options.image_scale)

@@ -1,19 +1,36 @@
-"""Target views: which they are, and what a policy may ask about them (`selection/targets.py`)."""
+"""Target views: which they are, and what policies may ask about them.
+
+That is the variance of their colours (`selection/targets.py`), or from how near by they are seen
+(`selection/gaps.py`).
+"""
 
 from collections.abc import Callable
 
 import jax
 import numpy as np
 
-from bavs_jax.cameras import Cameras, num_pixels
+from bavs_jax.cameras import (
+    Cameras,
+    num_pixels,
+    pixel_rays,
+    reduced_cameras,
+    take,
+    view_pixels,
+)
 from bavs_jax.fields.deformation import cell_sides, vertex_positions
+from bavs_jax.rendering.images import RenderChunk
 from bavs_jax.selection.directional import Look, LookFn, make_precision_fn
 from bavs_jax.selection.distances import uniform_ranks
+from bavs_jax.selection.gaps import ViewGaps, shares
 from bavs_jax.selection.targets import TargetInformation
-from bavs_jax.uncertainty.model import SceneSetup
+from bavs_jax.uncertainty.gaps import UNSEEN, TargetPixels, closeness_of_views
+from bavs_jax.uncertainty.images import render_stack
+from bavs_jax.uncertainty.model import Acquired, SceneSetup
 from bavs_jax.uncertainty.posterior import NOISE_VARIANCE, curvature_factor
+from bavs_jax.uncertainty.surface import Lookers
 
 CHANNELS = 3  # of colour
+MOST_PIXELS = 400  # of a target, that views are asked about
 
 # Views to ask about, from a key; None: candidates stand for them.
 MakeTargets = Callable[[jax.Array], Cameras | None]
@@ -76,4 +93,56 @@ def target_information(
         ),
         num_values=CHANNELS * num_pixels(targets),
         vertices=vertices,
+    )
+
+
+def view_gaps(
+    render: RenderChunk,
+    acquired: Acquired,
+    candidates: Cameras,
+    targets: Cameras,
+    *,
+    image_scale: float,
+    chunk: int,
+) -> ViewGaps:
+    """How near by training views see what T target views show, and candidates would.
+
+    Where surfaces are, and what hides what, is read from reduced renders of all of them.
+
+    Args:
+      render: depth and opacity of `chunk` rays.
+      acquired: the views trained on.
+      candidates: [C].
+      targets: [T].
+      image_scale: of width and height; targets are reduced further where they would have more than
+        `MOST_PIXELS`.
+      chunk: rays of one call of `render`.
+
+    Raises:
+      ValueError: views of different sizes (see `render_stack`).
+    """
+
+    def look(cameras, mask, scale=image_scale):
+        names = ("depth", "opacity")
+        small, *maps = render_stack(render, cameras, mask, scale=scale, chunk=chunk, names=names)
+        return Lookers(small, mask, *maps)
+
+    most = int(num_pixels(reduced_cameras(targets, image_scale)).max())
+    scale = image_scale * min(1.0, float(np.sqrt(MOST_PIXELS / most)))
+    wanted = look(targets, np.ones(len(targets), bool), scale)
+    view_ids, pixels = view_pixels(wanted.cameras, np.arange(len(targets)))
+    rays = jax.tree.map(np.asarray, pixel_rays(wanted.cameras, view_ids, pixels))
+    points = rays.origins + wanted.depth_maps.reshape(-1, 1) * rays.directions
+    shown = TargetPixels(
+        points=points.reshape(len(targets), -1, 3),
+        cameras=np.asarray(wanted.cameras.positions),
+        weight=wanted.opacity_maps.reshape(len(targets), -1),
+    )
+    trained_on = take(acquired.table.cameras, np.flatnonzero(acquired.is_training_view))
+    before, offered = (look(x, np.ones(len(x), bool)) for x in (trained_on, candidates))
+    return ViewGaps(
+        known=UNSEEN + np.asarray(closeness_of_views(shown, before)).sum(0),
+        closeness=np.asarray(closeness_of_views(shown, offered)),
+        pixel_weight=shown.weight,
+        target_weight=shares(closeness_of_views(shown, wanted), shown.weight),
     )

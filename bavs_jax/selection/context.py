@@ -9,6 +9,7 @@ from flax import struct
 from bavs_jax.arrays import Array
 from bavs_jax.selection import SelectionError
 from bavs_jax.selection.directional import DirectionalInformation
+from bavs_jax.selection.gaps import ViewGaps
 from bavs_jax.selection.information import Information
 from bavs_jax.selection.targets import TargetInformation
 
@@ -51,6 +52,8 @@ class Context(struct.PyTreeNode):
     directional: DirectionalInformation | None = struct.field(pytree_node=False, default=None)
     # What views told about each side of the field, as far as targets show it (`targets.py`).
     targets: TargetInformation | None = struct.field(pytree_node=False, default=None)
+    # From how near by views see the pixels of targets (`gaps.py`).
+    gaps: ViewGaps | None = struct.field(pytree_node=False, default=None)
     # Mean squared errors of renders of candidates against their photos.
     true_error_fn: SourceFn | None = struct.field(pytree_node=False, default=None)
 
@@ -68,6 +71,7 @@ def make_context(
     information: Information | None = None,
     directional: DirectionalInformation | None = None,
     targets: TargetInformation | None = None,
+    gaps: ViewGaps | None = None,
     true_error_fn: SourceFn | None = None,
 ) -> Context:
     """Checks and builds a `Context` with nothing picked yet, on the host.
@@ -80,8 +84,7 @@ def make_context(
       view_ids: [C] distinct integers >= 0; default 0 .. C - 1.
       mask: [C] bool, which candidates may be picked; default all.
       places: [P, 3] see `Context`; default the candidates.
-      mean_uncertainty_fn, information, directional, targets, true_error_fn: see
-        `Context`.
+      mean_uncertainty_fn, information, directional, targets, gaps, true_error_fn: see `Context`.
 
     Raises:
       SelectionError: on a wrong shape, a position that is not finite, or repeated view ids.
@@ -120,6 +123,7 @@ def make_context(
         information=information,
         directional=directional,
         targets=targets,
+        gaps=gaps,
         true_error_fn=true_error_fn,
     )
 
@@ -132,6 +136,8 @@ def require(ctx: Context, field: Literal["information"]) -> Information: ...
 def require(ctx: Context, field: Literal["directional"]) -> DirectionalInformation: ...
 @overload
 def require(ctx: Context, field: Literal["targets"]) -> TargetInformation: ...
+@overload
+def require(ctx: Context, field: Literal["gaps"]) -> ViewGaps: ...
 @overload
 def require(ctx: Context, field: Literal["true_error_fn"]) -> SourceFn: ...
 def require(ctx: Context, field: str):

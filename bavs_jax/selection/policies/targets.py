@@ -7,6 +7,7 @@ import numpy as np
 
 from bavs_jax.selection.context import require, score_candidates
 from bavs_jax.selection.directional import add_look
+from bavs_jax.selection.gaps import add_view, gap_gains
 from bavs_jax.selection.policies.distance import spread_score
 from bavs_jax.selection.policy import Policy
 from bavs_jax.selection.targets import TargetInformation, linear_gain, log_gain
@@ -33,6 +34,16 @@ def target_spread_score(key, ctx):
     return np.asarray(spread_score(key, ctx)) * target_score(key, ctx)
 
 
+def target_gaps_score(key, ctx):
+    """By how much a view lowers the predicted log error of target views (`selection/gaps.py`).
+
+    Ours. It asks from how near by, in angle, the pixels of target views are seen, and by whom; the
+    field says only where surfaces are.
+    """
+    del key
+    return score_candidates(ctx, partial(gap_gains, require(ctx, "gaps")))
+
+
 TARGET_INFORMATION = Policy(
     name="target_information",
     summary="Greedily the view that lowers the predicted colour variance of target views most.",
@@ -53,5 +64,13 @@ POLICIES = (
         name="target_spread",
         summary="Greedily the view of largest spread times information about target views.",
         score_fn=target_spread_score,
+    ),
+    Policy(
+        name="target_gaps",
+        summary="Greedily the view that closes most of the angular gaps of target views.",
+        score_fn=target_gaps_score,
+        update_fn=lambda ctx, index: ctx.replace(gaps=add_view(require(ctx, "gaps"), index)),
+        needs=frozenset({"gaps"}),
+        mode="greedy",
     ),
 )
