@@ -21,9 +21,9 @@ from bavs_jax.fields.deformation import cell_sides, vertex_positions
 from bavs_jax.rendering.images import RenderChunk
 from bavs_jax.selection.directional import Look, LookFn, make_precision_fn
 from bavs_jax.selection.distances import uniform_ranks
-from bavs_jax.selection.gaps import ViewGaps, shares
+from bavs_jax.selection.gaps import ViewGaps
 from bavs_jax.selection.targets import TargetInformation
-from bavs_jax.uncertainty.gaps import UNSEEN, TargetPixels, closeness_of_views
+from bavs_jax.uncertainty.gaps import UNSEEN, TargetPixels, closeness_of_views, target_shares
 from bavs_jax.uncertainty.images import render_stack
 from bavs_jax.uncertainty.model import Acquired, SceneSetup
 from bavs_jax.uncertainty.posterior import NOISE_VARIANCE, curvature_factor
@@ -144,5 +144,5 @@ def view_gaps(
         known=UNSEEN + np.asarray(closeness_of_views(shown, before)).sum(0),
         closeness=np.asarray(closeness_of_views(shown, offered)),
         pixel_weight=shown.weight,
-        target_weight=shares(closeness_of_views(shown, wanted), shown.weight),
+        target_weight=np.asarray(target_shares(shown)),
     )

@@ -22,7 +22,7 @@ from bavs_jax.arrays import Array, Indices
 
 
 class ViewGaps(NamedTuple):
-    """How close views are to n pixels of each of T targets, radians^-POWER."""
+    """How close views are to n pixels of each of T targets, radians^-2."""
 
     known: Array  # [T, n] `c_0` and the sum over training views and picks
     closeness: Array  # [C, T, n] of each candidate
@@ -41,27 +41,6 @@ def log_errors(known: Array, weight: Array) -> np.ndarray:
     total = weight.sum(-1)
     errors = (weight / np.asarray(known, np.float64)).sum(-1)
     return np.log(np.divide(errors, total, out=np.ones_like(total), where=total > 0.0))
-
-
-def shares(closeness: Array, pixel_weight: Array) -> np.ndarray:
-    """Weights of targets of which each region of views gets as much as any other, [T].
-
-    Targets that see the same from near by share what one of them would have: a pool that is crowded
-    on one side does not say that this side is wanted most.
-
-    Args:
-      closeness: [T, T, n] of each target, as a view, to the pixels of each.
-      pixel_weight: [T, n] >= 0.
-
-    Returns:
-      `1 / sum_s k_ts`, with `k_ts` the mean closeness of s to t's pixels over that of t itself; 0
-      for a target that shows no surface.
-    """
-    seen = np.asarray(closeness, np.float64)
-    likeness = np.einsum("stn,tn->ts", seen, np.asarray(pixel_weight))
-    own = np.diagonal(likeness)
-    total = likeness.sum(-1)
-    return np.divide(own, total, out=np.zeros_like(total), where=total > 0.0)
 
 
 def gap_gains(gaps: ViewGaps, indices: Indices) -> np.ndarray:

@@ -1,12 +1,12 @@
 """How far, in angle, pixels of target views are from the views that see the same surface.
 
 A pixel of a target view shows a point of the surface from one side. A view s that sees the point at
-the angle theta from there, and from r_s / r_t times as far, has the gap
+the angle theta from there has the closeness
 
-    gap^2 = theta^2 + LEAST^2 + (BLUR log2(max(r_s / r_t, 1)))^2
+    c = vis_s / (theta^2 + LEAST^2)
 
-to it, and the closeness `vis_s / gap^POWER`, where `vis_s` is the share of the point's light that
-reaches s. What follows for the choice of views is in `selection/gaps.py`.
+to it, where `vis_s` is the share of the point's light that reaches s. What follows for the choice
+of views is in `selection/gaps.py`.
 """
 
 from typing import NamedTuple
@@ -15,15 +15,11 @@ import jax
 import jax.numpy as jnp
 
 from bavs_jax.arrays import Array
-from bavs_jax.cameras import Cameras
 from bavs_jax.numerics import safe_divide
-from bavs_jax.uncertainty.measures import directions_from
 from bavs_jax.uncertainty.surface import Lookers, transmittance_to
 
-LEAST = 0.3  # radians; a look from nearer by is hardly better
-BLUR = 0.5  # radians that a look from twice as far is worse by
-POWER = 3.0  # by which errors grow with the gap
-UNSEEN = jnp.pi**-POWER  # the closeness of a look from the other side, which shows nothing
+LEAST = 0.2  # radians; a look from nearer by is hardly better
+UNSEEN = jnp.pi**-2  # the closeness of a look from the other side, which shows nothing
 
 
 class TargetPixels(NamedTuple):
@@ -34,29 +30,45 @@ class TargetPixels(NamedTuple):
     weight: Array  # [T, n] opacity in [0, 1]; 0 for a pixel that shows no surface
 
 
-def closeness(pixels: TargetPixels, camera: Cameras, depth_map, opacity_map) -> jax.Array:
-    """`vis / gap^POWER` of one view to each pixel, [T, n] in radians^-POWER; 0 where it is hidden.
-
-    Args:
-      pixels: of the targets.
-      camera: one camera without the axis of views.
-      depth_map, opacity_map: [H, W] its render (see `transmittance_to`).
+def angular_closeness(pixels: TargetPixels, position) -> jax.Array:
+    """`1 / (theta^2 + LEAST^2)` of a camera at `position` [3], were nothing hidden; [T, n].
 
     Numerics: the angle is `2 asin(|d - d_s| / 2)`, exact for near directions.
     """
-    away = pixels.points - pixels.cameras[:, None]
-    target_distance = jnp.linalg.norm(away, axis=-1)
-    directions = safe_divide(away, target_distance[..., None])
-    chord = jnp.linalg.norm(directions - directions_from(camera, pixels.points), axis=-1)
+    directions = unit_vectors(pixels.points - pixels.cameras[:, None])
+    chord = jnp.linalg.norm(directions - unit_vectors(pixels.points - position), axis=-1)
     angle = 2.0 * jnp.arcsin(jnp.clip(chord / 2.0, 0.0, 1.0))
-    distance = jnp.linalg.norm(pixels.points - camera.positions, axis=-1)
-    blur = BLUR * jnp.log2(jnp.maximum(safe_divide(distance, target_distance), 1.0))
-    seen = transmittance_to(camera, pixels.points, depth_map, opacity_map)
-    return seen * (angle**2 + LEAST**2 + blur**2) ** (-POWER / 2.0)
+    return 1.0 / (angle**2 + LEAST**2)
 
 
 @jax.jit
 def closeness_of_views(pixels: TargetPixels, lookers: Lookers) -> jax.Array:
-    """`closeness` [V, T, n] of V views, whatever their mask; one view after another."""
-    views = lookers.cameras, lookers.depth_maps, lookers.opacity_maps
-    return jax.lax.map(lambda view: closeness(pixels, *view), views)
+    """The closeness [V, T, n] of V views, whatever their mask; one view after another."""
+
+    def of_view(view):
+        camera, depth_map, opacity_map = view
+        seen = transmittance_to(camera, pixels.points, depth_map, opacity_map)
+        return seen * angular_closeness(pixels, camera.positions)
+
+    return jax.lax.map(of_view, (lookers.cameras, lookers.depth_maps, lookers.opacity_maps))
+
+
+@jax.jit
+def target_shares(pixels: TargetPixels) -> jax.Array:
+    """Weights [T] of targets by which each region of views counts as much as any other.
+
+    Targets that look from one side share what one of them would have, so that a pool which is
+    crowded on one side does not say that this side is wanted most: `1 / sum_s k_ts`, with `k_ts`
+    the mean `angular_closeness` of target s to the pixels of t, as a share of the largest there
+    is. Which part of the scene they show, and from how far, plays no part. 0 for a target that
+    shows no surface.
+    """
+    closeness = jax.lax.map(lambda position: angular_closeness(pixels, position), pixels.cameras)
+    total = pixels.weight.sum(-1)
+    likeness = LEAST**2 * safe_divide((closeness * pixels.weight).sum(-1), total)  # [s, t]
+    return safe_divide(jnp.where(total > 0.0, 1.0, 0.0), likeness.sum(0))
+
+
+def unit_vectors(vectors) -> jax.Array:
+    """Vectors [..., 3] at length 1; one of length 0 stays."""
+    return safe_divide(vectors, jnp.linalg.norm(vectors, axis=-1, keepdims=True))

@@ -8,6 +8,7 @@ import numpy as np
 from bavs_jax.selection.context import require, score_candidates
 from bavs_jax.selection.directional import add_look
 from bavs_jax.selection.gaps import add_view, gap_gains
+from bavs_jax.selection.policies.curvature import directional_score
 from bavs_jax.selection.policies.distance import spread_score
 from bavs_jax.selection.policy import Policy
 from bavs_jax.selection.targets import TargetInformation, linear_gain, log_gain
@@ -44,6 +45,21 @@ def target_gaps_score(key, ctx):
     return score_candidates(ctx, partial(gap_gains, require(ctx, "gaps")))
 
 
+def bavs_gaps_score(key, ctx):
+    """`target_gaps` times `directional`: what a view closes, and what the field learns by it.
+
+    Ours. Gaps know no more of the field than where its surfaces are; the curvature says how much
+    there is to learn of them from this side.
+    """
+    return target_gaps_score(key, ctx) * directional_score(key, ctx)
+
+
+def add_gaps_and_look(ctx, index):
+    """A picked view closes gaps, and its curvature joins the looks."""
+    information = add_look(require(ctx, "directional"), index)
+    return ctx.replace(gaps=add_view(require(ctx, "gaps"), index), directional=information)
+
+
 TARGET_INFORMATION = Policy(
     name="target_information",
     summary="Greedily the view that lowers the predicted colour variance of target views most.",
@@ -71,6 +87,14 @@ POLICIES = (
         score_fn=target_gaps_score,
         update_fn=lambda ctx, index: ctx.replace(gaps=add_view(require(ctx, "gaps"), index)),
         needs=frozenset({"gaps"}),
+        mode="greedy",
+    ),
+    Policy(
+        name="bavs_gaps",
+        summary="Greedily the view that closes most angular gaps, times directional information.",
+        score_fn=bavs_gaps_score,
+        update_fn=add_gaps_and_look,
+        needs=frozenset({"gaps", "directional"}),
         mode="greedy",
     ),
 )
