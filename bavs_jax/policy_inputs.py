@@ -31,6 +31,8 @@ from bavs_jax.selection.information import (
 )
 from bavs_jax.selection.policy import Policy
 from bavs_jax.target_inputs import (
+    GAP_TARGETS,
+    INFORMATION_TARGETS,
     MakeTargets,
     evenly_spaced_cameras,
     target_information,
@@ -53,7 +55,8 @@ class LookOptions(NamedTuple):
     image_scale: float  # of width and height, for the score (Eq 15)
     chunk: int  # rays of one compiled call
     cache_bytes: int = 2**30  # most memory for curvatures of candidates; the others are made anew
-    num_targets: int = 32  # most target views, evenly spaced among those there are
+    # Most target views, evenly spaced among those there are; None: what each kind can afford.
+    num_targets: int | None = None
 
 
 class PolicyInputs(NamedTuple):
@@ -184,7 +187,7 @@ class InputMaker:
         look_fn = target_fn = make_look_fn(
             candidates.cameras, self._candidate_curvature(acquired, candidates, seconds)
         )
-        cameras, rows = self._target_cameras(key, acquired, candidates)
+        cameras, rows = self._target_cameras(key, acquired, candidates, INFORMATION_TARGETS)
         if cameras is not candidates.cameras:
             curvature_fn = self._candidate_curvature(
                 acquired, candidates._replace(cameras=cameras), seconds
@@ -201,17 +204,17 @@ class InputMaker:
                 max_bytes=options.cache_bytes,
             )
 
-    def _target_cameras(self, key, acquired, candidates):
-        """Cameras that may be asked about, and which of them [N] are."""
+    def _target_cameras(self, key, acquired, candidates, most):
+        """Cameras that may be asked about, and which of them [N] are: `most` at most by default."""
         cameras, view_ids = self.make_targets(key), None
         if cameras is None:
             cameras = candidates.cameras if acquired.candidates is None else acquired.candidates
             view_ids = candidates.view_ids[: len(cameras)]
-        num = self.options.num_targets
+        num = self.options.num_targets or most
         return cameras, evenly_spaced_cameras(cameras.positions, num, view_ids=view_ids)
 
     def _gaps(self, policy, key, acquired, candidates, seconds):
-        cameras, rows = self._target_cameras(key, acquired, candidates)
+        cameras, rows = self._target_cameras(key, acquired, candidates, GAP_TARGETS)
         with _clock(seconds, "score"):
             return view_gaps(
                 partial(self._plain_images, acquired.train),

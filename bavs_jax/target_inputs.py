@@ -31,6 +31,8 @@ from bavs_jax.uncertainty.surface import Lookers
 
 CHANNELS = 3  # of colour
 MOST_PIXELS = 400  # of a target, that views are asked about
+INFORMATION_TARGETS = 32  # whose curvatures are made; seconds for a hundred candidates
+GAP_TARGETS = 128  # which need one render each
 
 # Views to ask about, from a key; None: candidates stand for them.
 MakeTargets = Callable[[jax.Array], Cameras | None]

@@ -6,7 +6,7 @@ from bavs_jax.candidates import candidate_cameras, scene_hemisphere
 from bavs_jax.scenes import Scene, SceneError
 from bavs_jax.scenes.pose_files import read_pose_file
 from bavs_jax.scenes.poses import transform_poses
-from bavs_jax.target_inputs import MakeTargets
+from bavs_jax.target_inputs import GAP_TARGETS, MakeTargets
 
 TARGET_KINDS = ("pool", "hemisphere", "file")
 
@@ -21,7 +21,7 @@ def build_targets(config, scene: Scene) -> MakeTargets:
     """
     kind = config.targets.kind
     if kind == "hemisphere":
-        num = config.targets.num
+        num = config.targets.num or GAP_TARGETS
         return lambda key: candidate_cameras(scene, scene_hemisphere(key, scene, num))
     if kind == "file":
         try:

@@ -52,7 +52,7 @@ NONE_IS_FINE = {
     *("data_dir", "load.downscale", "load.pool_size", "load.test_every", "load.split"),
     *("view_seed", "sampler_kind", "train.learning_rate", "uncertainty.prior_weight"),
     *("candidates.mode", "candidates.min_train_distance", "candidates.min_candidate_distance"),
-    "targets.poses_file",
+    *("targets.poses_file", "targets.num"),
 }
 
 

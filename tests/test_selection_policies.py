@@ -12,6 +12,7 @@ from bavs_jax.selection.batch import acquire
 from bavs_jax.selection.context import make_context
 from bavs_jax.selection.directional import DirectionalInformation, Look, make_precision_fn
 from bavs_jax.selection.distances import pairwise_distances
+from bavs_jax.selection.gaps import ViewGaps
 from bavs_jax.selection.information import Information, make_cached_curvature_fn, sparse_curvature
 from bavs_jax.selection.policies import POLICIES, get_policy
 from bavs_jax.selection.policies.distance import farthest_score
@@ -98,6 +99,24 @@ def target_sources(view_ids, *, ties):
     }
 
 
+def gap_sources(view_ids, *, ties):
+    """How near by candidates would see four pixels of three targets, one of which is empty."""
+
+    def closeness(index):
+        rng = np.random.default_rng(0 if ties else int(view_ids[index]))
+        return rng.exponential(size=(3, 4)) * (rng.uniform(size=(3, 4)) < 0.7)
+
+    rng = np.random.default_rng(3)
+    return {
+        "gaps": ViewGaps(
+            known=np.full((3, 4), 0.1) + rng.exponential(size=(3, 4)),
+            closeness=np.stack([closeness(index) for index in range(len(view_ids))]),
+            pixel_weight=rng.uniform(size=(3, 4)) * np.array([[1.0], [0.0], [1.0]]),
+            target_weight=np.array([1.0, 0.5, 0.3]),
+        )
+    }
+
+
 def true_error_sources(view_ids, *, ties):
     """Stands in for photos of the candidates."""
     fn = curvature_sources(view_ids, ties=ties)["mean_uncertainty_fn"]
@@ -110,6 +129,7 @@ SOURCES = {
     "information": information_sources,
     "directional": directional_sources,
     "targets": target_sources,
+    "gaps": gap_sources,
     "true_error_fn": true_error_sources,
 }
 
@@ -369,6 +389,7 @@ def test_spread_without_any_view_begins_in_the_middle():
         ("bavs_spread", "spread", "directional"),
         ("farthest_informative", "farthest", "directional"),
         ("target_spread", "spread", "target_information_log"),
+        ("bavs_gaps", "target_gaps", "directional"),
     ],
 )
 def test_products_of_two_scores(name, first, second):

@@ -187,7 +187,8 @@ def get_config() -> ConfigDict:
     # --- what policies by target information ask about (bavs_jax/selection/targets.py) ---
     config.targets = ConfigDict()
     config.targets.kind = "pool"  # "pool": the candidates; "hemisphere" (Eq 14); "file"
-    config.targets.num = 32  # most target views, evenly spaced among those there are
+    # Most target views, evenly spaced among those there are; None: 32, or 128 for gaps.
+    config.targets.num = placeholder(int)
     # Of kind "file": poses in your own coordinates, such as the transforms.json of suggest_views.
     config.targets.poses_file = placeholder(str)
 
