@@ -138,6 +138,7 @@ def view_gaps(
     shown = TargetPixels(
         points=points.reshape(len(targets), -1, 3),
         cameras=np.asarray(wanted.cameras.positions),
+        focal=np.asarray(wanted.cameras.intrinsics[:, 0]) * (image_scale / scale),
         weight=wanted.opacity_maps.reshape(len(targets), -1),
     )
     trained_on = take(acquired.table.cameras, np.flatnonzero(acquired.is_training_view))

@@ -13,11 +13,12 @@ from bavs_jax.selection.gaps import ViewGaps, add_view, gap_gains, log_errors
 from bavs_jax.selection.policies import POLICIES
 from bavs_jax.target_inputs import MOST_PIXELS, view_gaps
 from bavs_jax.uncertainty.gaps import (
+    BLUR,
     LEAST,
     UNSEEN,
     TargetPixels,
-    angular_closeness,
     closeness_of_views,
+    squared_gap,
     target_shares,
 )
 from bavs_jax.uncertainty.model import Acquired
@@ -35,6 +36,7 @@ def random_pixels(seed, num_targets=3, num_pixels=20):
     return TargetPixels(
         points=rng.uniform(-1.0, 1.0, (num_targets, num_pixels, 3)).astype(np.float32),
         cameras=3.0 * rng.normal(size=(num_targets, 3)).astype(np.float32),
+        focal=rng.uniform(10.0, 40.0, num_targets).astype(np.float32),
         weight=rng.uniform(size=(num_targets, num_pixels)).astype(np.float32),
     )
 
@@ -51,9 +53,12 @@ def test_closeness_equals_loops_over_views_targets_and_pixels():
     expected = np.zeros(found.shape)
     for view, target, pixel in np.ndindex(found.shape):
         point = pixels.points[target, pixel]
-        angle = slow_angle(point, lookers.cameras.positions[view], pixels.cameras[target])
-        seen = slow_transmittance(lookers, view, point)
-        expected[view, target, pixel] = seen / (angle**2 + LEAST**2)
+        place, wanted = np.asarray(lookers.cameras.positions[view]), pixels.cameras[target]
+        widths = [np.linalg.norm(point - x, axis=-1) for x in (place, wanted)]
+        coarser = widths[0] / lookers.cameras.intrinsics[view, 0] * pixels.focal[target] / widths[1]
+        blur = BLUR * np.log2(max(coarser, 1.0))
+        gap = slow_angle(point, place, wanted) ** 2 + LEAST**2 + blur**2
+        expected[view, target, pixel] = slow_transmittance(lookers, view, point) / gap
     assert 0.1 < (expected > 0.0).mean() < 0.95, "some must be in the images, and some not"
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
 
@@ -68,25 +73,29 @@ def test_jitted_equals_eager(num_pixels):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
 
 
-def test_closeness_at_known_angles():
-    pixels = TargetPixels(np.zeros((1, 1, 3)), np.array([[0.0, 0.0, 2.0]]), np.ones((1, 1)))
+def test_gaps_at_known_angles_and_widths():
+    at_origin = np.zeros((1, 1, 3)), np.array([[0.0, 0.0, 2.0]]), np.array([10.0]), np.ones((1, 1))
     for angle in (0.0, 1e-4, 0.5, np.pi / 2, np.pi):
-        place = 5.0 * np.array([np.sin(angle), 0.0, np.cos(angle)])
-        found = angular_closeness(pixels, place.astype(np.float32))
-        np.testing.assert_allclose(found, [[1.0 / (angle**2 + LEAST**2)]], rtol=1e-5)
+        place = 2.0 * np.array([np.sin(angle), 0.0, np.cos(angle)])
+        for away, focal, octaves in ((1.0, 10.0, 0), (4.0, 10.0, 2), (4.0, 40.0, 0), (1.0, 5.0, 1)):
+            pixels = TargetPixels(*at_origin)
+            found = squared_gap(pixels, (away * place).astype(np.float32), focal)
+            expected = angle**2 + LEAST**2 + (BLUR * octaves) ** 2
+            np.testing.assert_allclose(found, [[expected]], rtol=1e-5)
+            alike = squared_gap(pixels, (away * place).astype(np.float32))
+            np.testing.assert_allclose(alike, [[angle**2 + LEAST**2]], rtol=1e-5)
     assert pytest.approx(1.0 / np.pi**2) == UNSEEN
 
 
-def test_angles_know_neither_the_scale_nor_the_axes():
+def test_gaps_know_neither_the_scale_nor_the_axes():
     pixels, place = random_pixels(4), np.array([1.0, 2.0, -3.0])
     turn = Rotation.random(random_state=0).as_matrix()
-    moved = TargetPixels(
-        (7.0 * pixels.points @ turn.T + 1.0).astype(np.float32),
-        (7.0 * pixels.cameras @ turn.T + 1.0).astype(np.float32),
-        pixels.weight,
+    moved = pixels._replace(
+        points=(7.0 * pixels.points @ turn.T + 1.0).astype(np.float32),
+        cameras=(7.0 * pixels.cameras @ turn.T + 1.0).astype(np.float32),
     )
     for a, b in (
-        (angular_closeness(pixels, place), angular_closeness(moved, 7.0 * turn @ place + 1.0)),
+        (squared_gap(pixels, place, 20.0), squared_gap(moved, 7.0 * turn @ place + 1.0, 20.0)),
         (target_shares(pixels), target_shares(moved)),
     ):
         np.testing.assert_allclose(a, b, rtol=2e-4)
@@ -97,7 +106,8 @@ def test_targets_of_one_side_share_the_weight_of_one():
     points, near = np.zeros((4, 5, 3)), [0.0, 0.0, 2.0]
     # From another distance along the same line, too.
     cameras = np.array([near, near, [0.0, 0.0, 9.0], [0.0, 0.0, -2.0]])
-    found = np.asarray(target_shares(TargetPixels(points, cameras, np.ones((4, 5)))))
+    pixels = TargetPixels(points, cameras, np.full(4, 20.0), np.ones((4, 5)))
+    found = np.asarray(target_shares(pixels))
     across = LEAST**2 / (np.pi**2 + LEAST**2)
     np.testing.assert_allclose(found[:3], 1.0 / (3.0 + across), rtol=1e-5)
     np.testing.assert_allclose(found[3], 1.0 / (1.0 + 3.0 * across), rtol=1e-5)
@@ -215,9 +225,12 @@ def test_a_ball_is_known_from_where_it_was_looked_at():
     assert gap_gains(add_view(gaps, 2), [2])[0] == pytest.approx(np.log(2.0) / 2.0, rel=0.01)
 
 
-def test_large_targets_are_reduced_further():
-    gaps = ball_gaps([[3.0, 0.0, 0.0]], [[0.0, 3.0, 0.0]], [[0.0, 0.0, 3.0]])
+def test_large_targets_are_reduced_further_and_are_as_sharp_as_before():
+    place = [3.0, 0.0, 0.0]
+    gaps = ball_gaps([place], [[0.0, 3.0, 0.0]], [place])
     assert 0.8 * MOST_PIXELS <= gaps.pixel_weight.size <= 1.2 * MOST_PIXELS
+    shown = np.asarray(gaps.pixel_weight) > 0.0
+    np.testing.assert_allclose(gaps.known[shown].max(), UNSEEN + LEAST**-2, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["target_gaps", "bavs_gaps"])
