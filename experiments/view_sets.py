@@ -9,7 +9,8 @@
 Reads finished runs of one scene, of any policies and schedules, and writes `view_sets.json` and
 `view_sets.html`, for each number of views: the spread over random sets, and how much of it is noise
 of training (sets that several runs were trained on); where other policies' sets stand among the
-random ones; and how well each number that a set can be described by ranks the random sets.
+random ones; and how well each number that a set can be described by ranks all sets, whoever chose
+them. Each round that was trained anew is a set of its own.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from absl import flags
 from ml_collections import ConfigDict
 
 from bavs_jax.metrics.view_sets import correlation, describe, explained, fit_line, visible_surface
+from bavs_jax.selection.policies import POLICIES
+from bavs_jax.uncertainty.model import RECONSTRUCTION
 from experiments import runtime
 from experiments.build import initial_views, load_config_scene
 from experiments.files import leaves, write_json
@@ -46,6 +49,9 @@ ALIKE = (
 )
 ALIKE += ("hash_grid.", "nerf_mlp.", "mip_mlp.", "march.", "proposal.", "train.")
 
+# Policies whose own field differs from all others'.
+OTHER_FIELDS = {name for name, p in POLICIES.items() if p.field_kind != RECONSTRUCTION}
+
 FLAGS = flags.FLAGS
 runtime.define_cache_flags()
 flags.DEFINE_string("workdir", None, "Folder for view_sets.json and its page.")
@@ -63,6 +69,7 @@ def find_runs(folders: list[str]) -> list[tuple[Run, ConfigDict]]:
     for folder in folders:
         paths = sorted(pathlib.Path(folder).rglob("summary.json"))
         found = [run for path in paths for run in stats.completed(load_runs(path.parent))]
+        found = [run for run in found if run.policy not in OTHER_FIELDS]
         if not found:
             raise ReportError(f"--runs: {folder} holds no finished run; give other folders")
         runs += found
@@ -85,25 +92,35 @@ def run_config(run: Run) -> ConfigDict:
     return check_config(config)
 
 
-def trained_views(scene, run: Run, config: ConfigDict) -> np.ndarray:
-    """The views that the field of a run's last round was trained on, sorted."""
+def trained_sets(scene, run: Run, config: ConfigDict) -> list[tuple[np.ndarray, float]]:
+    """The sorted views that each round's field was trained on, and its PSNR.
+
+    Of a run that trains on, the last round alone: earlier ones were trained for less.
+    """
     seed = run.seed if config.view_seed is None else config.view_seed
-    views = set(initial_views(scene, seed, config.num_initial).tolist())
-    for row in run.rounds[1:]:  # the first holds what the run began with
-        views |= set(row["selected"])
-    if len(views) != run.rounds[-1]["num_views"] or max(views) >= scene.num_views:
-        raise ReportError(f"{run.folder}: its views are none of the scene's; leave that run out")
-    return np.array(sorted(views))
+    views, found = set(initial_views(scene, seed, config.num_initial).tolist()), []
+    for number, row in enumerate(run.rounds):
+        if number:  # the first holds what the run began with
+            views |= set(row["selected"])
+        if len(views) != row["num_views"] or max(views) >= scene.num_views:
+            raise ReportError(f"{run.folder}: its views are none of the scene's; leave it out")
+        found.append((np.array(sorted(views)), row["psnr"]))
+    return found if config.from_scratch else found[-1:]
 
 
 def measure_sets(scene, runs: list[tuple[Run, ConfigDict]]) -> list[dict]:
     """By number of views: what runs were trained on, what that is described by, and their PSNR."""
-    surface, by_number = visible_surface(scene), {}
+    surface, by_number, known = visible_surface(scene), {}, set()
     for run, config in runs:
-        views = trained_views(scene, run, config)
-        row = {"policy": run.policy, "seed": run.seed, "views": views.tolist()}
-        row |= {"psnr": run.rounds[-1]["psnr"], "described": describe(scene, views, surface)}
-        by_number.setdefault(len(views), []).append(row)
+        for number, (views, psnr) in enumerate(trained_sets(scene, run, config)):
+            if (training := (tuple(views), psnr)) in known:
+                continue  # policies of a seed share the round that they began with
+            known.add(training)
+            # What a run began with, nobody has chosen.
+            row = {"policy": run.policy if number else RANDOM, "seed": run.seed}
+            row |= {"views": views.tolist(), "psnr": psnr}
+            row["described"] = describe(scene, views, surface)
+            by_number.setdefault(len(views), []).append(row)
     return [{"num_views": num, **summarise(by_number[num])} for num in sorted(by_number)]
 
 
@@ -117,15 +134,13 @@ def summarise(rows: list[dict]) -> dict:
     squares = sum(np.var(psnrs) * len(psnrs) for psnrs in repeated)
     noise = float(np.sqrt(squares / freedom)) if freedom else None
     # A set that was trained on several times counts once.
-    by_set = {tuple(row["views"]): row for row in rows if row["policy"] == RANDOM}
-    sets = [{**row, "psnr": float(np.mean(same[views]))} for views, row in by_set.items()]
-    psnr = np.array([row["psnr"] for row in sets])
-    found = {"rows": rows, "num_sets": len(sets), "random_psnr": psnr.tolist(), "noise": noise}
-    found |= {"features": {}, "explained": None}
-    if not sets:
-        return found
-    names = list(sets[0]["described"])
-    features = np.array([[row["described"][name] for name in names] for row in sets])
+    by_set = {tuple(row["views"]): row for row in rows}
+    psnr = np.array([np.mean(same[views]) for views in by_set])
+    is_random = np.array([row["policy"] == RANDOM for row in by_set.values()])
+    found = {"rows": rows, "num_sets": len(by_set), "random_psnr": psnr[is_random].tolist()}
+    names = list(rows[0]["described"])
+    features = np.array([[row["described"][name] for name in names] for row in by_set.values()])
+    found["noise"] = noise
     found["features"] = {n: correlation(features[:, i], psnr) for i, n in enumerate(names)}
     found["explained"] = explained(features, psnr)
     if found["explained"] is not None:

@@ -11,6 +11,7 @@ import pytest
 
 from bavs_jax.cameras import pixel_rays, view_pixels
 from bavs_jax.metrics.view_sets import correlation, describe, explained, fit_line, visible_surface
+from bavs_jax.uncertainty.gaps import BLUR, LEAST, UNSEEN
 from experiments.build import initial_views, load_config_scene
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene
@@ -62,7 +63,7 @@ def test_more_views_never_leave_more_unseen(ball):
     scene, surface = ball
     order = np.random.default_rng(0).permutation(scene.pool)
     found = [describe(scene, order[:n], surface) for n in range(1, len(order) + 1)]
-    for name in ("candidates_gap", "candidates_gap_largest", "test_gap", "unseen", "sides"):
+    for name in ("candidates_gap", "candidates_gap_largest", "test_gap", "unseen", "sides", "gaps"):
         assert (np.diff([row[name] for row in found]) <= 1e-12).all(), name
     assert found[-1]["candidates_gap"] == 0.0 < found[0]["candidates_gap"]
     assert found[0]["unseen"] > 0.3 > found[-1]["unseen"]
@@ -85,6 +86,28 @@ def test_descriptors_of_one_camera_in_closed_form(ball):
         ray = (positions[view] - point) / np.linalg.norm(positions[view] - point)
         by_hand.append((1 - ray @ towards) / 2 if seen else 1.0)
     np.testing.assert_allclose(found["sides"], np.mean(by_hand), rtol=1e-6)
+    np.testing.assert_allclose(found["gaps"], gaps_by_hand(scene, [view], surface), rtol=1e-5)
+    several = scene.pool[1:4]
+    found = describe(scene, several, surface)["gaps"]
+    np.testing.assert_allclose(found, gaps_by_hand(scene, several, surface), rtol=1e-5)
+
+
+def gaps_by_hand(scene, views, surface):
+    """The mean over test views of the log of the mean predicted error of their points."""
+    positions, focal = np.asarray(scene.cameras.positions), scene.cameras.intrinsics[:, 0]
+    errors = {}
+    for number, point in enumerate(surface.points):
+        test, known = int(surface.view[number]), UNSEEN
+        wanted = positions[test] - point
+        for view in views:
+            away = positions[view] - point
+            cosine = away @ wanted / np.linalg.norm(away) / np.linalg.norm(wanted)
+            coarser = np.linalg.norm(away) / focal[view] / np.linalg.norm(wanted) * focal[test]
+            blur = BLUR * np.log2(max(coarser, 1.0))
+            gap = np.arccos(np.clip(cosine, -1.0, 1.0)) ** 2 + LEAST**2 + blur**2
+            known += surface.seen[view, number] / gap
+        errors.setdefault(test, []).append(1.0 / known)
+    return np.mean([np.log(np.mean(e)) for e in errors.values()])
 
 
 def test_descriptors_do_not_depend_on_the_unit_and_need_no_depth(ball):
@@ -185,8 +208,9 @@ def test_the_script_finds_what_the_sets_are_worth(tmp_path, cache):
     folders = [f"--runs={tmp_path / name}" for name in ("sets", "noise", "other")]
     done = script(*folders, f"--workdir={tmp_path / 'out'}")
     assert done.returncode == 0, done.stderr
-    (group,) = json.loads((tmp_path / "out" / "view_sets.json").read_text())["numbers"]
-    assert (group["num_views"], group["num_sets"]) == (6, 60)
+    first_round, group = json.loads((tmp_path / "out" / "view_sets.json").read_text())["numbers"]
+    assert first_round["num_views"] == 4 and first_round["rows"][0]["policy"] == "random"
+    assert (group["num_views"], group["num_sets"], len(group["random_psnr"])) == (6, 61, 60)
     assert 0.01 < group["noise"] < 0.04
     assert group["explained"] > 0.75 and group["features"]["test_gap"] < -0.95
     (row,) = [row for row in group["rows"] if row["policy"] == "farthest"]

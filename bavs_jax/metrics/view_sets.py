@@ -9,6 +9,7 @@ from scipy.stats import spearmanr
 
 from bavs_jax.cameras import pixel_rays, project, view_pixels
 from bavs_jax.scenes.base import Scene
+from bavs_jax.uncertainty.gaps import BLUR, LEAST, UNSEEN
 
 NUM_POINTS = 5000  # of the surface, that a set is described by
 BUFFER_POINTS = 200_000  # of the surface, that decide which of those hide behind others
@@ -25,6 +26,8 @@ class Surface(NamedTuple):
     points: np.ndarray  # [P, 3] scene units
     towards: np.ndarray  # [P, 3] unit, to the test camera
     distance: np.ndarray  # [P] to it, scene units
+    view: np.ndarray  # [P] which of the test views
+    width: np.ndarray  # [P] of its pixel there, scene units
     seen: np.ndarray  # [V, P] bool, of all views of the scene; only the pool's are filled
 
 
@@ -45,11 +48,20 @@ def visible_surface(scene: Scene, *, seed: int = 0) -> Surface | None:
     rays = jax.tree.map(np.asarray, pixel_rays(scene.cameras, view_ids[kept], pixels[kept]))
     points = rays.origins + scene.depth[rows[kept]][:, None] * rays.directions
     few = slice(None, NUM_POINTS)
+    of_test, distance = view_ids[kept][few], scene.depth[rows[kept]][few]
+    focal = np.asarray(scene.cameras.intrinsics[:, 0])
     seen = np.zeros((scene.num_views, len(points[few])), bool)
     tolerance = TOLERANCE * float(np.linalg.norm(scene.box[1] - scene.box[0]))
     for view in scene.pool:
         seen[view] = _seen_by(scene, view, points, tolerance)[few]
-    return Surface(points[few], -rays.directions[few], scene.depth[rows[kept]][few], seen)
+    return Surface(
+        points=points[few],
+        towards=-rays.directions[few],
+        distance=distance,
+        view=of_test,
+        width=distance / focal[of_test],
+        seen=seen,
+    )
 
 
 _project = jax.jit(project)
@@ -89,7 +101,8 @@ def describe(scene: Scene, views: np.ndarray, surface: Surface | None) -> dict[s
       `unseen`: share of the surface in test views that no view of the set sees; `sides`: mean of
       `(1 - cos a) / 2` over that surface, a the angle at the point between the test camera and
       the nearest view of the set that sees it, 1 where none does; `resolution`: mean of
-      `log2(d_test / d_set)` over what is seen, d the distance of the closest one.
+      `log2(d_test / d_set)` over what is seen, d the distance of the closest one; `gaps`: the mean
+      predicted log error of test views (`selection/gaps.py`), on the true surface.
     """
     positions, centre = np.asarray(scene.cameras.positions, np.float64), scene.centre
     offsets = positions - centre
@@ -116,6 +129,13 @@ def describe(scene: Scene, views: np.ndarray, surface: Surface | None) -> dict[s
     is_seen = np.isfinite(closest)
     ratio = np.log2(surface.distance[is_seen] / closest[is_seen])
     found["resolution"] = float(np.mean(ratio)) if is_seen.any() else 0.0
+    width = distance / np.asarray(scene.cameras.intrinsics)[views, :1]
+    octaves = np.log2(np.maximum(width / surface.width, 1.0))
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    closeness = np.where(seen, 1.0 / (angle**2 + LEAST**2 + (BLUR * octaves) ** 2), 0.0)
+    errors = 1.0 / (UNSEEN + closeness.sum(axis=0))
+    _, view, counts = np.unique(surface.view, return_inverse=True, return_counts=True)
+    found["gaps"] = float(np.mean(np.log(np.bincount(view, errors) / counts)))
     return found
 
 

@@ -15,7 +15,7 @@ from experiments.reporting.tables import Cell, Collected, Table, dash, interval_
 FILE = "view_sets.json"
 RANDOM = "random"  # the policy whose sets the others are held against
 SHOWN = 4  # descriptors in the plot, the best ones
-FEW = "fewer than three random sets a descriptor"
+FEW = "fewer than three sets a descriptor"
 
 
 def sets_table(result: dict) -> Table:
@@ -71,7 +71,7 @@ def policies_table(result: dict) -> Table | None:
 
 
 def features_table(result: dict) -> Table:
-    """Rank correlation of each descriptor with PSNR, over random sets."""
+    """Rank correlation of each descriptor with PSNR, over all sets."""
     groups = [group for group in result["numbers"] if group["features"]]
     names = list(groups[0]["features"]) if groups else []
     rows = []
@@ -92,7 +92,7 @@ def view_set_tables(path: pathlib.Path) -> Collected:
 
 
 def features_plot(result: dict) -> Markup | None:
-    """PSNR of random sets against the descriptors that rank them best; other policies on top."""
+    """PSNR of sets against the descriptors that rank them best."""
     groups = [group for group in result["numbers"] if group["num_sets"] > 1]
     if not groups:
         return None
