@@ -7,8 +7,6 @@ Any option of the config can be given as a flag, such as --config.seeds='(0,1,2)
 stopped goes on when it is started again with the same --workdir.
 """
 
-from __future__ import annotations
-
 from absl import flags
 from ml_collections import config_flags
 

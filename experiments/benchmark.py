@@ -9,8 +9,6 @@ compiled anew, and writes `benchmark.json` and `benchmark.html`. Other programs 
 every number worse; what a matrix product and a copy reach at the same time is noted, too.
 """
 
-from __future__ import annotations
-
 import pathlib
 import time
 

@@ -1,7 +1,5 @@
 """From a config to a scene, its first views and candidates, and all that a run needs of it."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from functools import cache, cached_property, partial

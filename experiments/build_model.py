@@ -1,7 +1,5 @@
 """From a config and a scene to a field, its sampler, the model of both, and how it is trained."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator

@@ -10,8 +10,6 @@ fewer digits on some accelerators; JAX_DEFAULT_MATMUL_PRECISION=highest in the e
 all of them.
 """
 
-from __future__ import annotations
-
 import sys
 
 import jax

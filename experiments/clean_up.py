@@ -9,8 +9,6 @@ WORKDIR/cleanup.json, with the measures at every threshold that was tried, and t
 after into WORKDIR/<policy>/seed_<n>/cleanup/views.png.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

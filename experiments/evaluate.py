@@ -1,7 +1,5 @@
 """How good a field is on test views, and how good pictures without any field would be."""
 
-from __future__ import annotations
-
 import jax
 import numpy as np
 from PIL import Image

@@ -9,8 +9,6 @@ Started again it goes on with what is missing, also in a folder of `experiments.
 with the same config.
 """
 
-from __future__ import annotations
-
 import pathlib
 import time
 

@@ -16,8 +16,6 @@ Needs `pip install 'bavs_jax[export]'`. For density, sigma and colour at points 
 `TrainedRun.point_fn` in experiments/trained.py.
 """
 
-from __future__ import annotations
-
 import pathlib
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Files that are written whole or not at all, and what the folder of an experiment holds."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import errno
@@ -231,7 +229,7 @@ class Part(NamedTuple):
         return f"{self.policy or first}/seed_{self.seed}"
 
     @property
-    def initial(self) -> Part:
+    def initial(self) -> "Part":
         """The part that makes the round 0 it starts from."""
         return self._replace(policy=None)
 

@@ -8,8 +8,6 @@ it is, and what they do not settle moves: WORKDIR/draws.json says how far pixels
 views and in test views, and WORKDIR/<policy>/seed_<n>/draws/draws.png shows it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from absl import flags
 from matplotlib.figure import Figure

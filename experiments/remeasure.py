@@ -7,8 +7,6 @@ result.json and the folder's summary. What was measured then must come out again
 files of another scene are noticed. What has been measured by the same network is left alone.
 """
 
-from __future__ import annotations
-
 from absl import flags
 
 from bavs_jax.metrics.perceptual import NETS

@@ -3,8 +3,6 @@
 python -m experiments.report --workdir=runs/quickstart
 """
 
-from __future__ import annotations
-
 from absl import flags
 
 from experiments import runtime

@@ -1,7 +1,5 @@
 """What every script needs: errors in one line, flags, caches, progress, and what it runs on."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import importlib.metadata

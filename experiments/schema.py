@@ -1,7 +1,5 @@
 """What every option of experiments/configs/base.py may be, checked before any work is done."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from functools import partial

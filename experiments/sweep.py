@@ -10,8 +10,6 @@ ablations do. Started again, a sweep goes on: what is finished is not run again.
 While it runs, no other sweep may start in its folder.
 """
 
-from __future__ import annotations
-
 import contextlib
 import pathlib
 import sys

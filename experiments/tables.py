@@ -10,8 +10,6 @@ names which tables, `policies=bavs,random` which rows, and `paper=table_1` the p
 rows are put beside ours.
 """
 
-from __future__ import annotations
-
 import pathlib
 import re
 import sys

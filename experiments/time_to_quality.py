@@ -11,8 +11,6 @@ with imports, loading and compilation, and stands while test views are measured.
 scene's photos are made before.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import pathlib

@@ -1,7 +1,5 @@
 """A field that a run has trained, taken up from its folder or trained now, and its posterior."""
 
-from __future__ import annotations
-
 import json
 import pathlib
 from collections.abc import Callable

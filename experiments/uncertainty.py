@@ -4,8 +4,6 @@ Each model and seed leaves files of numbers, arrays and intervals and is not mea
 numbers come last. A calibration can be put around renders of new views.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import pathlib

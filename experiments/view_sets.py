@@ -12,8 +12,6 @@ of training (sets that several runs were trained on); where other policies' sets
 random ones; and how well each number that a set can be described by ranks the random sets.
 """
 
-from __future__ import annotations
-
 import pathlib
 
 import numpy as np

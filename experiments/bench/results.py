@@ -1,7 +1,5 @@
 """The result files of the benchmark and of time to quality, as tables and pages."""
 
-from __future__ import annotations
-
 import pathlib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The same state on two devices: what each makes of it, and how far apart that is."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax

@@ -1,7 +1,5 @@
 """The stages of a run on a trained field: how fast each is, and how its time grows."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import time
@@ -97,7 +95,7 @@ class Subject:
         acquired = Acquired(None, problem.table, self.is_training, 0, label=self.scene.name)
         self.state = train_aside(self.config, problem.trainer, key, acquired, problem.kind, track)
 
-    def changed(self, **options) -> Subject:
+    def changed(self, **options) -> "Subject":
         """The same field under other options; `__` in a name stands for a dot."""
         other = copy.copy(self)
         other.config = self.config.copy_and_resolve_references()

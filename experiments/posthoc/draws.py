@@ -1,7 +1,5 @@
 """A run under offsets drawn from its posterior, and how far pixels move (Fig 3)."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax

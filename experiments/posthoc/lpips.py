@@ -1,7 +1,5 @@
 """LPIPS for runs that have ended without it, from the fields that they left behind."""
 
-from __future__ import annotations
-
 import pathlib
 from collections.abc import Sequence
 

@@ -4,8 +4,6 @@ With --config a run is trained as far as --workdir does not hold it yet; without
 checkpoints in --workdir are taken up as they are.
 """
 
-from __future__ import annotations
-
 import pathlib
 import time
 from collections.abc import Callable, Iterator

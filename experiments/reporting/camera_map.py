@@ -1,7 +1,5 @@
 """Maps of the cameras seen from above the scene: candidates, scores and choices of each round."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A page: one template, filled and written whole; it needs no other file and no network."""
 
-from __future__ import annotations
-
 import os
 import pathlib
 from collections.abc import Sequence

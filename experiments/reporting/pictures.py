@@ -1,7 +1,5 @@
 """Pictures of test views: images of a page, panels of a figure, and the figures as files."""
 
-from __future__ import annotations
-
 import base64
 import io
 import pathlib

@@ -1,7 +1,5 @@
 """Curves of runs; how every figure looks, and how it becomes an element of a page."""
 
-from __future__ import annotations
-
 import io
 import os
 import pathlib

@@ -1,7 +1,5 @@
 """The report of a run: what came out in plain words, then all numbers, pictures and choices."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

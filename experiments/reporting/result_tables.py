@@ -1,7 +1,5 @@
 """All that the result files of a folder say, whichever script wrote them, as named tables."""
 
-from __future__ import annotations
-
 import pathlib
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Result files, read and checked: the runs of a folder, their pictures, and what they chose."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A suggestion as files: the chosen poses in several formats, numbers, and a page with reasons."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

@@ -1,7 +1,5 @@
 """A table: cells that may say why they are empty, as Markdown, CSV or LaTeX; HTML: table.html."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io

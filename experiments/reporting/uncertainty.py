@@ -1,7 +1,5 @@
 """`uncertainty.json`, its tables and its page: how well uncertainty tells error."""
 
-from __future__ import annotations
-
 import json
 import pathlib
 

@@ -1,7 +1,5 @@
 """Random sets of views as tables and as a plot: how much is there to win, and by what."""
 
-from __future__ import annotations
-
 import pathlib
 
 import numpy as np

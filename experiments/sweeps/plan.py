@@ -1,7 +1,5 @@
 """What a sweep is made of: axes, a folder for each setting, a job for each part, `sweep.json`."""
 
-from __future__ import annotations
-
 import ast
 import copy
 import dataclasses
