@@ -1,13 +1,10 @@
 """Pictures of test views: images of a page, panels of a figure, and the figures as files."""
 
-import base64
-import io
 import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -26,30 +23,6 @@ PANEL = 2.1  # inches
 
 
 # --- pictures of a page ---
-
-
-class Picture(NamedTuple):
-    """One image of a page."""
-
-    uri: str
-    caption: str
-    low: str = ""
-    high: str = ""
-
-
-def png_uri(image: np.ndarray) -> str:
-    """[H, W, 3] uint8 as a `data:` address that stands in the page itself."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="png", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-
-
-def colourise(values: np.ndarray, low: float, high: float, name: str) -> np.ndarray:
-    """[H, W] values as [H, W, 3] uint8 colours; grey where a value is not finite."""
-    scaled = (values - low) / max(high - low, 1e-12)
-    rgb = colormaps[name](np.clip(np.nan_to_num(scaled, nan=0.0), 0.0, 1.0))[..., :3]
-    rgb[~np.isfinite(values)] = 0.6
-    return np.round(255.0 * rgb).astype(np.uint8)
 
 
 def shrink(image: np.ndarray, max_side: int) -> np.ndarray:
