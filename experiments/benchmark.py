@@ -1,4 +1,4 @@
-"""Measures how fast every stage is, and how its time grows.
+"""Measures how fast every stage is.
 
     python -m experiments.benchmark --workdir=runs/benchmark
     python -m experiments.benchmark --workdir=runs/benchmark_lego \\
@@ -16,23 +16,21 @@ import jax
 from absl import flags
 from ml_collections import config_flags
 
-from experiments import runtime
-from experiments.bench import stages
-from experiments.bench.results import BENCHMARK, benchmark_tables, write_result_page
+from experiments import runtime, stages
 from experiments.build import load_config_scene
 from experiments.configs import base
 from experiments.files import write_json
+from experiments.reporting.benchmark import BENCHMARK, benchmark_tables, write_result_page
 from experiments.reporting.tables import collected_text
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS
 CONFIG = "Scene, field and training; see experiments/configs/base.py; set as --config.name=value."
 config_flags.DEFINE_config_file("config", base.__file__, CONFIG, lock_config=True)
-SIZES = "How much is measured, as --sizes.name=value; see experiments/bench/stages.py."
+SIZES = "How much is measured, as --sizes.name=value; see experiments/stages.py."
 config_flags.DEFINE_config_dict("sizes", stages.default_sizes(), SIZES)
 flags.DEFINE_string("workdir", None, "Folder for benchmark.json, benchmark.html and the trace.")
 flags.DEFINE_integer("num_views", 20, "Training views.", 1)
-flags.DEFINE_bool("growth", True, "Measure how each stage grows too.")
 flags.DEFINE_bool("profile", False, "Write a trace of one run of each stage to WORKDIR/trace.")
 
 
@@ -50,7 +48,6 @@ def benchmark(config, sizes, folder: pathlib.Path) -> None:
             for name, run in runs.items():
                 with jax.profiler.TraceAnnotation(name):
                     jax.block_until_ready(run())
-    growth = stages.measure_growth(subject, sizes) if FLAGS.growth else {}
     result = {
         "schema_version": 1,
         "device": runtime.device_name(),
@@ -64,7 +61,6 @@ def benchmark(config, sizes, folder: pathlib.Path) -> None:
         "peak_device_memory_mb": device_memory,
         "stages": found,
         "ceilings": ceilings,
-        "growth": growth,
         "scene": scene.name,
         "num_views": FLAGS.num_views,
         "sizes": sizes.to_dict(),

@@ -19,10 +19,10 @@ from absl import flags
 from ml_collections import config_flags
 
 from bavs_jax.training.fit import MAX_RESTARTS
-from experiments import files, runtime
+from experiments import files, jobs, runtime
+from experiments import sweep_plan as plan
 from experiments.reporting.report import write_report
 from experiments.schema import check_config, given_config
-from experiments.sweeps import jobs, plan
 
 FLAGS = flags.FLAGS
 runtime.define_cache_flags()

@@ -26,15 +26,15 @@ from ml_collections import config_flags
 from bavs_jax.active import round_keys
 from bavs_jax.training.fit import fit
 from experiments import runtime
-from experiments.bench import results
-from experiments.bench.stages import SEED, Subject
 from experiments.build import load_config_scene, run_key
 from experiments.configs import base
 from experiments.evaluate import evaluate_views, evenly_spaced
 from experiments.files import write_json
+from experiments.reporting import benchmark as results
 from experiments.reporting.tables import collected_text
 from experiments.runtime import ConfigError, shown, track
 from experiments.schema import given_config
+from experiments.stages import SEED, Subject
 
 FLAGS = flags.FLAGS
 CONFIG = "Scene, field and training; see experiments/configs/base.py; set as --config.name=value."

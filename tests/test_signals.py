@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from experiments.sweeps.jobs import death_words
+from experiments.jobs import death_words
 from tests.scene_files import write_nerfstudio
 from tests.toy_runs import toy_flags
 

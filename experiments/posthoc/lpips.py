@@ -9,7 +9,7 @@ from experiments.evaluate import measure_test_views
 from experiments.files import collect, is_completed, write_json
 from experiments.reporting.report import write_report
 from experiments.runtime import ConfigError, WorkdirError
-from experiments.sweeps.plan import read_record
+from experiments.sweep_plan import read_record
 from experiments.trained import TrainedRun, field_kind, load_run, saved_config
 
 PSNR_TOLERANCE = 0.02  # dB; another machine adds up in another order

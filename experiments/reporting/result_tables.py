@@ -6,15 +6,14 @@ from functools import partial
 
 import numpy as np
 
-from experiments.bench import results as bench
-from experiments.bench.same_numbers import DEVICE_FILE, differences_table
-from experiments.reporting import run_tables, stats, uncertainty, view_sets
+from experiments.reporting import benchmark, run_tables, stats, uncertainty, view_sets
 from experiments.reporting.results import Run, load_runs, policies_of, read_result
-from experiments.reporting.tables import Collected, Table, interval_cell
+from experiments.reporting.tables import Cell, Collected, Table, dash, interval_cell
 from experiments.runtime import ReportError
-from experiments.sweeps.plan import FILE as SWEEP_FILE
-from experiments.sweeps.plan import Record, read_record
+from experiments.sweep_plan import FILE as SWEEP_FILE
+from experiments.sweep_plan import Record, read_record
 
+DEVICE_FILE = "check_device.json"
 INTERVALS = "means over seeds ± half of the 95 % interval"
 
 
@@ -141,6 +140,17 @@ def _device(path: pathlib.Path) -> Collected:
     return Collected(f"`{result['command']}` ({how})", tables)
 
 
+def differences_table(differences: dict[str, dict[str, float]]) -> Table:
+    """A row for each field, a column for each thing that was compared."""
+    names = list(dict.fromkeys(what for row in differences.values() for what in row))
+    rows = []
+    for name, row in differences.items():
+        missing = dash(f"not compared for {name}")
+        cells = [Cell(f"{row[what]:.1e}") if what in row else missing for what in names]
+        rows.append((Cell(name), *cells))
+    return Table(("field", *names), tuple(rows))
+
+
 def _trained(make_table: Callable[[list[dict]], Table], path: pathlib.Path) -> Collected:
     """What a script on a trained run has measured, over its seeds."""
     result = read_result(path)
@@ -212,8 +222,8 @@ def _line(name: str, by_seed, digits: int, *, gap: bool = False) -> list:
 FILES: dict[str, Callable[[pathlib.Path], Collected]] = {
     uncertainty.NAME: _uncertainty,
     DEVICE_FILE: _device,
-    bench.BENCHMARK: bench.benchmark_tables,
-    bench.QUALITY: bench.quality_tables,
+    benchmark.BENCHMARK: benchmark.benchmark_tables,
+    benchmark.QUALITY: benchmark.quality_tables,
     "cleanup.json": partial(_trained, cleanup_table),
     "draws.json": partial(_trained, draws_table),
     "geometry.json": partial(_trained, geometry_table),
