@@ -8,7 +8,6 @@ stopped goes on when it is started again with the same --workdir.
 """
 
 from absl import flags
-from ml_collections import config_flags
 
 from bavs_jax.selection.policies import POLICIES
 from experiments import runner, runtime
@@ -17,13 +16,7 @@ from experiments.schema import given_config
 FLAGS = flags.FLAGS
 runtime.define_cache_flags()
 runtime.define_device_flags()
-config_flags.DEFINE_config_file(
-    "config",
-    None,
-    "What to run, such as experiments/configs/quickstart.py; every option is explained in "
-    "experiments/configs/base.py and can be set as --config.name=value.",
-    lock_config=True,
-)
+runtime.define_config_flag("What to run, such as experiments/configs/quickstart.py")
 flags.DEFINE_string("workdir", None, "Folder for results, checkpoints and report.html.")
 flags.DEFINE_string(
     "part", None, "Make just this sub-folder, such as bavs/seed_0, without summary and report."

@@ -25,8 +25,7 @@ from experiments.reporting.tables import collected_text
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS
-CONFIG = "Scene, field and training; see experiments/configs/base.py; set as --config.name=value."
-config_flags.DEFINE_config_file("config", base.__file__, CONFIG, lock_config=True)
+runtime.define_config_flag("Scene, field and training", base.__file__)
 SIZES = "How much is measured, as --sizes.name=value; see experiments/stages.py."
 config_flags.DEFINE_config_dict("sizes", stages.default_sizes(), SIZES)
 flags.DEFINE_string("workdir", None, "Folder for benchmark.json, benchmark.html and the trace.")

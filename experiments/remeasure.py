@@ -11,7 +11,7 @@ from absl import flags
 
 from bavs_jax.metrics.perceptual import NETS
 from experiments import runtime
-from experiments.posthoc.lpips import remeasure
+from experiments.posthoc import remeasure
 
 FLAGS = flags.FLAGS
 runtime.define_cache_flags()

@@ -22,6 +22,7 @@ import numpy as np
 from absl import app, flags, logging
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
+from ml_collections import config_flags
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
@@ -176,6 +177,14 @@ def given_folder(flag: str, hint: str, *, exists: bool = False) -> pathlib.Path:
         why = f"{shown(text)} cannot be used ({reason(error)})"
         raise ConfigError(f"--{flag}: {why}; name {hint}") from None
     return path
+
+
+def define_config_flag(what: str, default: str | None = None) -> None:
+    """Gives a script the flag of its config: `what` that is, with the file of a default."""
+    text = f"{what}; options are explained in experiments/configs/base.py, set as "
+    config_flags.DEFINE_config_file(
+        "config", default, f"{text}--config.name=value.", lock_config=True
+    )
 
 
 # --- caches ----------------------------------------------------------------------------------

@@ -21,8 +21,8 @@ from bavs_jax.uncertainty.channel import EXTENTS, SCALES, VARIANTS
 from bavs_jax.uncertainty.conformal_scale import SCALES as INTERVAL_SCALES
 from bavs_jax.uncertainty.curvature import WEIGHTINGS
 from bavs_jax.uncertainty.models import MODELS
+from experiments.build import TARGET_KINDS
 from experiments.build_model import SAMPLERS
-from experiments.build_targets import TARGET_KINDS
 from experiments.files import leaves, modern_value
 from experiments.runtime import ConfigError, one_line, shown
 

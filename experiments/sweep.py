@@ -26,9 +26,7 @@ from experiments.schema import check_config, given_config
 
 FLAGS = flags.FLAGS
 runtime.define_cache_flags()
-config_flags.DEFINE_config_file(
-    "config", None, "What to run; see experiments.active_selection.", lock_config=True
-)
+runtime.define_config_flag("What to run")
 flags.DEFINE_string("workdir", None, "Folder for all results.")
 flags.DEFINE_multi_string(
     "axis", [], "What to vary: name=value,value or seed=0:5; may be repeated."

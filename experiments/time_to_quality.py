@@ -21,7 +21,6 @@ import time
 
 import jax
 from absl import flags
-from ml_collections import config_flags
 
 from bavs_jax.active import round_keys
 from bavs_jax.training.fit import fit
@@ -37,8 +36,7 @@ from experiments.schema import given_config
 from experiments.stages import SEED, Subject
 
 FLAGS = flags.FLAGS
-CONFIG = "Scene, field and training; see experiments/configs/base.py; set as --config.name=value."
-config_flags.DEFINE_config_file("config", base.__file__, CONFIG, lock_config=True)
+runtime.define_config_flag("Scene, field and training", base.__file__)
 flags.DEFINE_string("workdir", None, "Folder for time_to_quality.json and its page.")
 flags.DEFINE_integer("num_views", 20, "Training views.", 1)
 flags.DEFINE_integer("num_test_views", 25, "Test views, evenly spaced; 0: all.", 0)
