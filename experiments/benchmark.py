@@ -19,9 +19,7 @@ from ml_collections import config_flags
 from experiments import runtime, stages
 from experiments.build import load_config_scene
 from experiments.configs import base
-from experiments.files import write_json
-from experiments.reporting.benchmark import BENCHMARK, benchmark_tables, write_result_page
-from experiments.reporting.tables import collected_text
+from experiments.reporting.benchmark import BENCHMARK, write_result
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS
@@ -40,7 +38,10 @@ def benchmark(config, sizes, folder: pathlib.Path) -> None:
     subject = stages.Subject(config, scene, FLAGS.num_views)
     found, samples, runs = stages.measure_stages(subject, sizes)
     # Before what a user's run does not do.
-    memory, device_memory = runtime.peak_memory_mb(), runtime.peak_device_memory_mb()
+    memory = {
+        "peak_memory_mb": runtime.peak_memory_mb(),
+        "peak_device_memory_mb": runtime.peak_device_memory_mb(),
+    }
     ceilings = stages.measure_ceilings(sizes)
     if FLAGS.profile:
         with jax.profiler.trace(str(folder / "trace")):
@@ -49,30 +50,23 @@ def benchmark(config, sizes, folder: pathlib.Path) -> None:
                     jax.block_until_ready(run())
     result = {
         "schema_version": 1,
-        "device": runtime.device_name(),
         "train_rays_per_s": found["train"]["rays_per_s"],
         "train_samples_per_s": samples,
         "render_rays_per_s": found["render"]["rays_per_s"],
         "curvature_rays_per_s": found["curvature"]["rays_per_s"],
         "candidates_per_s": found["score"]["candidates_per_s"],
         "batch_select_ms": 1e3 / found["select"]["batches_per_s"],
-        "peak_memory_mb": memory,
-        "peak_device_memory_mb": device_memory,
+        **memory,
         "stages": found,
         "ceilings": ceilings,
         "scene": scene.name,
         "num_views": FLAGS.num_views,
         "sizes": sizes.to_dict(),
         "config": config.to_dict(),
-        "command": runtime.command_line(),
-        "versions": runtime.versions(),
+        **runtime.made_by(),
         "total_s": time.monotonic() - start,
     }
-    path = folder / BENCHMARK
-    write_json(path, result)
-    tables = benchmark_tables(path)
-    page = write_result_page(path, tables, "How fast bavs_jax is")
-    print(f"{collected_text(tables)}\nnumbers: {path}\npage:    {page}")
+    write_result(folder / BENCHMARK, result, "How fast bavs_jax is")
     if FLAGS.profile:
         print(f"trace:   {folder / 'trace'}, for Perfetto or TensorBoard")
 

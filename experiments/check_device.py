@@ -44,13 +44,11 @@ def main() -> None:
         wrong = stages.too_large(found, FLAGS.tolerance)
         result = {
             "schema_version": 1,
-            "device": runtime.device_name(),
+            **runtime.made_by(),
             "matmul_precision": str(jax.config.jax_default_matmul_precision or "default"),
             "tolerance": FLAGS.tolerance,
             "differences": found,
             "above_tolerance": wrong,
-            "command": runtime.command_line(),
-            "versions": runtime.versions(),
         }
         write_json(path, result)
     print(f"numbers: {path}\n{markdown(differences_table(found))}")

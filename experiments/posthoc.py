@@ -129,10 +129,8 @@ def write_rows(path: pathlib.Path, run: TrainedRun, rows: list[dict]) -> None:
         "schema_version": 1,
         "scene": run.problem.scene.name,
         "kind": run.problem.config.loader,
-        "command": runtime.command_line(),
         "config": run.problem.config.to_dict(),
-        "versions": runtime.versions(),
-        "device": runtime.device_name(),
+        **runtime.made_by(),
         "rows": rows,
     }
     write_json(path, result)

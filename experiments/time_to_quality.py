@@ -30,7 +30,6 @@ from experiments.configs import base
 from experiments.evaluate import evaluate_views, evenly_spaced
 from experiments.files import write_json
 from experiments.reporting import benchmark as results
-from experiments.reporting.tables import collected_text
 from experiments.runtime import ConfigError, shown, track
 from experiments.schema import given_config
 from experiments.stages import SEED, Subject
@@ -75,11 +74,7 @@ def compare_caches(config, folder: pathlib.Path) -> None:
         "command": runtime.command_line(),
         "versions": runtime.versions(),
     }
-    path = folder / results.QUALITY
-    write_json(path, result)
-    found = results.quality_tables(path)
-    page = results.write_result_page(path, found, "Time to quality")
-    print(f"{collected_text(found)}\nnumbers: {path}\npage:    {page}")
+    results.write_result(folder / results.QUALITY, result, "Time to quality")
 
 
 def run_part(config, folder: pathlib.Path, targets: list[str]) -> None:

@@ -108,7 +108,7 @@ def test_a_closed_iterator_leaves_no_process(tmp_path):
 
 def test_a_process_ends_with_the_program_that_started_it(tmp_path):
     """The starter is killed with SIGKILL, so that it can do nothing about it."""
-    child = "from experiments.runtime import end_with_parent as e; e(); "
+    child = "from experiments.active_selection import end_with_parent as e; e(); "
     child += "import os, time; print('pid', os.getpid(), flush=True); time.sleep(100)"
     starter = (
         "import pathlib, sys, time; from experiments.jobs import open_process; "

@@ -6,10 +6,11 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from experiments.files import write_json
 from experiments.reporting import plots
 from experiments.reporting.page import Section, write_page
 from experiments.reporting.results import read_result
-from experiments.reporting.tables import Cell, Collected, Table, dash, seconds
+from experiments.reporting.tables import Cell, Collected, Table, collected_text, dash, seconds
 
 BENCHMARK, QUALITY = "benchmark.json", "time_to_quality.json"
 STAGES = {
@@ -145,6 +146,7 @@ def quality_plot(result: dict) -> Markup:
     return plots.to_svg(figure, salt="quality", label="PSNR against seconds")
 
 
+FILES = {BENCHMARK: benchmark_tables, QUALITY: quality_tables}
 STOOD = "From the start of the process; the clock stands while test views are measured."
 SECTIONS = {  # of a page: the title of a table, what is said below it, and its plot
     "stages": ("Each stage", "Rates are medians over uniformly drawn training pixels.", None),
@@ -152,13 +154,14 @@ SECTIONS = {  # of a page: the title of a table, what is said below it, and its 
 }
 
 
-def write_result_page(path: pathlib.Path, found: Collected, title: str) -> pathlib.Path:
-    """A page beside a result file; its tables are `found`."""
-    result, sections = read_result(path), []
+def write_result(path: pathlib.Path, result: dict, title: str) -> None:
+    """Writes a result file of `FILES` and a page beside it, and prints its tables."""
+    write_json(path, result)
+    found, sections = FILES[path.name](path), []
     for name, table in found.tables.items():
         heading, note, plot = SECTIONS[name]
         sections.append(Section(heading, table, note, [plot(result)] if plot else []))
     sections[0] = sections[0]._replace(note=" ".join([sections[0].note, *found.notes]))
     page, what = path.with_suffix(".html"), f"{result['scene']}, {result['num_views']} views"
     write_page(page, title=f"{title}: {what}", made=result, sections=sections)
-    return page
+    print(f"{collected_text(found)}\nnumbers: {path}\npage:    {page}")

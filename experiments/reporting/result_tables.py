@@ -222,8 +222,7 @@ def _line(name: str, by_seed, digits: int, *, gap: bool = False) -> list:
 FILES: dict[str, Callable[[pathlib.Path], Collected]] = {
     uncertainty.NAME: _uncertainty,
     DEVICE_FILE: _device,
-    benchmark.BENCHMARK: benchmark.benchmark_tables,
-    benchmark.QUALITY: benchmark.quality_tables,
+    **benchmark.FILES,
     "cleanup.json": partial(_trained, cleanup_table),
     "draws.json": partial(_trained, draws_table),
     "geometry.json": partial(_trained, geometry_table),
