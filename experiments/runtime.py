@@ -206,9 +206,7 @@ def use_compilation_cache(folder: pathlib.Path) -> None:
 def define_cache_flags() -> None:
     """Gives a script the flags of the compilation cache, which it keeps by default."""
     flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
-    text = (
-        "Their folder, $XDG_CACHE_HOME/bavs_jax/compiled or in ~/.cache by default."
-    )
+    text = "Their folder, $XDG_CACHE_HOME/bavs_jax/compiled or in ~/.cache by default."
     flags.DEFINE_string("compilation_cache_dir", "", text)
 
 
