@@ -23,9 +23,8 @@ from experiments import runtime
 from experiments.build import initial_views, load_config_scene
 from experiments.files import leaves, write_json
 from experiments.reporting import stats
-from experiments.reporting.page import Section, write_page
 from experiments.reporting.results import Run, load_runs
-from experiments.reporting.tables import collected_text
+from experiments.reporting.tables import Section, collected_text, write_page
 from experiments.reporting.view_sets import FILE, RANDOM, features_plot, view_set_tables
 from experiments.runtime import ReportError
 from experiments.schema import check_config

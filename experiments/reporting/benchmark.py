@@ -8,9 +8,17 @@ from matplotlib.ticker import EngFormatter
 
 from experiments.files import write_json
 from experiments.reporting import plots
-from experiments.reporting.page import Section, write_page
 from experiments.reporting.results import read_result
-from experiments.reporting.tables import Cell, Collected, Table, collected_text, dash, seconds
+from experiments.reporting.tables import (
+    Cell,
+    Collected,
+    Section,
+    Table,
+    collected_text,
+    dash,
+    seconds,
+    write_page,
+)
 
 BENCHMARK, QUALITY = "benchmark.json", "time_to_quality.json"
 STAGES = {

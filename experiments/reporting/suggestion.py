@@ -25,7 +25,6 @@ from experiments.evaluate import render_with_bar
 from experiments.files import read_json, write_atomic, write_json
 from experiments.reporting import plots
 from experiments.reporting.camera_map import SCORE_MAP
-from experiments.reporting.page import Section, write_page
 from experiments.reporting.pictures import (
     Panel,
     colour_bar,
@@ -33,7 +32,7 @@ from experiments.reporting.pictures import (
     shrink,
     uncertainty_limits,
 )
-from experiments.reporting.tables import Cell, Table, dash
+from experiments.reporting.tables import Cell, Section, Table, dash, write_page
 from experiments.runtime import command_line, device_name, peak_memory_mb, versions, warn
 from experiments.suggestion import Options, Suggestion, in_matter
 from experiments.trained import TrainedRun

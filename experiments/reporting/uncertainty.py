@@ -12,8 +12,7 @@ from matplotlib.ticker import PercentFormatter
 
 from bavs_jax.metrics.ause import removal_fractions, variant_name
 from experiments.files import cut_pictures, write_atomic
-from experiments.reporting import page, plots, stats
-from experiments.reporting.page import Section
+from experiments.reporting import plots, stats, tables
 from experiments.reporting.pictures import (
     ERROR_LIMIT,
     ERROR_MAP,
@@ -22,7 +21,7 @@ from experiments.reporting.pictures import (
     panel_table,
 )
 from experiments.reporting.results import read_result
-from experiments.reporting.tables import Cell, Table, dash, interval_cell
+from experiments.reporting.tables import Cell, Section, Table, dash, interval_cell
 from experiments.runtime import ReportError
 
 RESULT_VERSION = 2
@@ -202,7 +201,7 @@ def write_page(path: pathlib.Path, result: dict, *, arrays: dict, variant: str) 
         ),
     ]
     title = f"Uncertainty against error: {result['scene']}"
-    page.write_page(path, title=title, made=result, sections=sections)
+    tables.write_page(path, title=title, made=result, sections=sections)
 
 
 def _interval_section(result: dict, quantity: str) -> Section:
