@@ -171,12 +171,7 @@ def _build_sampler(config, scene: Scene, kind: str) -> Sampler:
 
 
 def build_model(
-    config,
-    scene: Scene,
-    num_views: int,
-    kind: str,
-    flow: FlowField,
-    mesh: Mesh | None = None,
+    config, scene: Scene, num_views: int, kind: str, flow: FlowField, mesh: Mesh | None = None
 ) -> RayField:
     """The model of one of `KINDS`; compiles nothing yet.
 

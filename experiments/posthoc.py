@@ -66,11 +66,7 @@ def define_flags() -> None:
 
 
 def trained_runs() -> Iterator[TrainedRun]:
-    """The runs that the flags name, one after another; one scene and one compilation for all.
-
-    Raises:
-      ConfigError, WorkdirError, SceneError: flags, folder or scene cannot be used.
-    """
+    """The runs that the flags name, one after another; one scene and one compilation for all."""
     folder, config = runtime.given_folder("workdir", "the folder of a run"), given_config()
     runtime.start_cache()
     is_new = config is not None
@@ -148,12 +144,9 @@ def farthest_view(run: TrainedRun, view_ids) -> int:
 def draw_views(
     run: TrainedRun, view_ids, *, num_draws: int, scale: float, limit
 ) -> tuple[list[dict], float]:
-    """Renders views at the mode and for every draw.
+    """Renders views [n] of the pixel table, training views among them, at the mode and D draws.
 
     Args:
-      run: the run.
-      view_ids: [n] rows of the pixel table, training views among them.
-      num_draws: D >= 2.
       scale: temperature of `draw_offsets`; 0 takes `noise_scale` of the training views shown.
       limit: largest offset, scene units.
 
@@ -229,18 +222,11 @@ def remeasure(
     policies: Sequence[str] = (),
     data_dir: str = "",
 ) -> None:
-    """Every setting of a sweep, or the one experiment that the folder holds.
+    """Measures every setting of a sweep, or the one experiment that the folder holds.
 
-    Args:
-      folder: of the runs.
-      command: that is noted in their result files.
-      lpips_net: network of LPIPS.
-      policies: whose runs; none: all.
-      data_dir: where scenes are; empty: where the runs had them.
-
-    Raises:
-      ConfigError: LPIPS is not installed, or there is no finished run of a policy.
-      WorkdirError, SceneError: the folder or the scene cannot be used.
+    Of all policies, if none is named, and with the scenes of the runs, unless `data_dir` is where
+    they are now. The `command` is noted in the result files. Raises ConfigError if LPIPS is not
+    installed or a policy has no finished run.
     """
     record = read_record(folder)
     names = ["."] if record is None else [row["folder"] for row in record.settings]
@@ -277,11 +263,7 @@ def _has_lpips(result: dict, net: str) -> bool:
 
 
 def _measure_run(run: TrainedRun, result: dict, label: str, command: str) -> None:
-    """Measures one run's last field and rewrites its result file.
-
-    Raises:
-      WorkdirError: the field does not have the PSNR that its result says.
-    """
+    """Measures one run's last field, whose PSNR must be the known one; rewrites its result file."""
     config, path, last = run.problem.config, run.folder / "result.json", result["rounds"][-1]
     measures = measure_test_views(run.problem, run.state.train, config.num_test_final, label)
     if not abs(measures["psnr"] - last["psnr"]) < PSNR_TOLERANCE:

@@ -25,12 +25,7 @@ from experiments.build import (
     stream_key,
 )
 from experiments.build_model import train_with_bar
-from experiments.choices import (
-    acquisition_arrays,
-    load_choices,
-    save_choice,
-    write_next_views,
-)
+from experiments.choices import acquisition_arrays, load_choices, save_choice, write_next_views
 from experiments.files import Part, write_arrays, write_json
 from experiments.reporting.report import write_report
 from experiments.reporting.results import bound_words

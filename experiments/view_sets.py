@@ -32,16 +32,9 @@ from experiments.trained import renewed_config
 
 # Options that runs must share, or their numbers cannot be compared.
 ALIKE = (
-    "loader",
-    "scene",
-    "image_size",
-    "load.",
-    "pool.",
-    "rays_per_pixel",
-    "field_kind",
-    "sampler_kind",
+    *("loader", "scene", "image_size", "load.", "pool.", "rays_per_pixel", "field_kind"),
+    *("sampler_kind", "hash_grid.", "nerf_mlp.", "mip_mlp.", "march.", "proposal.", "train."),
 )
-ALIKE += ("hash_grid.", "nerf_mlp.", "mip_mlp.", "march.", "proposal.", "train.")
 
 FLAGS = flags.FLAGS
 runtime.define_cache_flags()
@@ -143,9 +136,8 @@ def main() -> None:
     result = {
         "schema_version": 1,
         "scene": scene.name,
+        **runtime.made_by(),
         "device": runs[0][0].result["device"],
-        "command": runtime.command_line(),
-        "versions": runtime.versions(),
         "numbers": measure_sets(scene, runs),
     }
     write_json(folder / FILE, result)

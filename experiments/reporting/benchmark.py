@@ -149,7 +149,6 @@ def quality_plot(result: dict) -> Markup:
     axes.set_xlim(0.0, None)
     axes.set_xlabel("seconds since the start, without measuring")
     axes.set_title("PSNR on test views (dB)")
-    plots.tidy(axes)
     axes.legend()
     return plots.to_svg(figure, salt="quality", label="PSNR against seconds")
 

@@ -111,14 +111,9 @@ def views_figure(
 ) -> Figure:
     """A row for each test view: the truth, then each policy's render and rendered uncertainty.
 
-    Args:
-      pictures: of each policy, what its run left in `pictures.npz`.
-      num_views: most rows, of the views that all of them show.
-      limits: of the colours of uncertainty; None: those of these pictures.
-      errors: whether the error of a render stands between it and its uncertainty.
-
-    Raises:
-      ReportError: there is no such view.
+    Of each policy `pictures` are what its run left in `pictures.npz`; at most `num_views` that all
+    of them show are shown, ReportError of none. `limits` are of the colours of uncertainty, by
+    default those of these pictures; with `errors` that of each render is beside it.
     """
     places = {p: {int(v): i for i, v in enumerate(a["view_ids"])} for p, a in pictures.items()}
     first, *others = places.values()
@@ -159,14 +154,8 @@ def write_figures(
 ) -> list[pathlib.Path]:
     """Writes every figure that the results of a folder have numbers for, and says where.
 
-    Args:
-      workdir: with `summary.json` and the arrays of each run.
-      form: one of `FORMATS`.
-      policies: which, in this order; none: all.
-      num_views: most test views.
-
-    Raises:
-      ReportError: a file that cannot be used, or a policy without a run.
+    Of some `policies` in this order, or of all, and at most `num_views` test views; `form` is one
+    of `FORMATS`.
     """
     runs = load_runs(workdir, policies)
     shown = policies_of(runs)

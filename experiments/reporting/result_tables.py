@@ -37,16 +37,8 @@ def collect_tables(
 
     Of an experiment: quality at the last shared number of views, round by round, and where the
     time went. Of a sweep: its settings against each other; of one over scenes also their mean.
-
-    Args:
-      folder: with `summary.json`, or of a sweep.
-      paper: a table of the paper whose rows are put beside ours, or beside means over scenes; see
-        `run_tables.PAPER`.
-      only: policies to show, in this order; by default all.
-
-    Raises:
-      ReportError: a file that cannot be used; no result so far; one of `only` without a run; or
-        `paper` where settings are no scenes.
+    Rows of `paper`, a table of `run_tables.PAPER`, are put beside ours; `only` names policies to
+    show, in this order. Raises ReportError for a file of no use, or where there is no result.
     """
     record = read_record(folder)
     if record is not None and any(row["values"] for row in record.settings):

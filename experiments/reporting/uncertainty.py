@@ -218,7 +218,7 @@ def _interval_section(result: dict, quantity: str) -> Section:
 def _axes() -> tuple[Figure, Axes]:
     figure = Figure(figsize=(5.6, 4.0))
     axes = figure.add_subplot()
-    plots.tidy(axes, "y")
+    axes.grid(axis="y")
     return figure, axes
 
 
