@@ -1,4 +1,4 @@
-"""Measures how fast every stage is, and how its time grows.
+"""Measures how fast every stage is.
 
     python -m experiments.benchmark --workdir=runs/benchmark
     python -m experiments.benchmark --workdir=runs/benchmark_lego \\
@@ -9,8 +9,6 @@ compiled anew, and writes `benchmark.json` and `benchmark.html`. Other programs 
 every number worse; what a matrix product and a copy reach at the same time is noted, too.
 """
 
-from __future__ import annotations
-
 import pathlib
 import time
 
@@ -18,23 +16,18 @@ import jax
 from absl import flags
 from ml_collections import config_flags
 
-from experiments import runtime
-from experiments.bench import stages
-from experiments.bench.results import BENCHMARK, benchmark_tables, write_result_page
+from experiments import runtime, stages
 from experiments.build import load_config_scene
 from experiments.configs import base
-from experiments.files import write_json
-from experiments.reporting.tables import collected_text
+from experiments.reporting.benchmark import BENCHMARK, write_result
 from experiments.schema import given_config
 
 FLAGS = flags.FLAGS
-CONFIG = "Scene, field and training; see experiments/configs/base.py; set as --config.name=value."
-config_flags.DEFINE_config_file("config", base.__file__, CONFIG, lock_config=True)
-SIZES = "How much is measured, as --sizes.name=value; see experiments/bench/stages.py."
+runtime.define_config_flag("Scene, field and training", base.__file__)
+SIZES = "How much is measured, as --sizes.name=value; see experiments/stages.py."
 config_flags.DEFINE_config_dict("sizes", stages.default_sizes(), SIZES)
 flags.DEFINE_string("workdir", None, "Folder for benchmark.json, benchmark.html and the trace.")
 flags.DEFINE_integer("num_views", 20, "Training views.", 1)
-flags.DEFINE_bool("growth", True, "Measure how each stage grows too.")
 flags.DEFINE_bool("profile", False, "Write a trace of one run of each stage to WORKDIR/trace.")
 
 
@@ -45,41 +38,35 @@ def benchmark(config, sizes, folder: pathlib.Path) -> None:
     subject = stages.Subject(config, scene, FLAGS.num_views)
     found, samples, runs = stages.measure_stages(subject, sizes)
     # Before what a user's run does not do.
-    memory, device_memory = runtime.peak_memory_mb(), runtime.peak_device_memory_mb()
+    memory = {
+        "peak_memory_mb": runtime.peak_memory_mb(),
+        "peak_device_memory_mb": runtime.peak_device_memory_mb(),
+    }
     ceilings = stages.measure_ceilings(sizes)
     if FLAGS.profile:
         with jax.profiler.trace(str(folder / "trace")):
             for name, run in runs.items():
                 with jax.profiler.TraceAnnotation(name):
                     jax.block_until_ready(run())
-    growth = stages.measure_growth(subject, sizes) if FLAGS.growth else {}
     result = {
         "schema_version": 1,
-        "device": runtime.device_name(),
         "train_rays_per_s": found["train"]["rays_per_s"],
         "train_samples_per_s": samples,
         "render_rays_per_s": found["render"]["rays_per_s"],
         "curvature_rays_per_s": found["curvature"]["rays_per_s"],
         "candidates_per_s": found["score"]["candidates_per_s"],
         "batch_select_ms": 1e3 / found["select"]["batches_per_s"],
-        "peak_memory_mb": memory,
-        "peak_device_memory_mb": device_memory,
+        **memory,
         "stages": found,
         "ceilings": ceilings,
-        "growth": growth,
         "scene": scene.name,
         "num_views": FLAGS.num_views,
         "sizes": sizes.to_dict(),
         "config": config.to_dict(),
-        "command": runtime.command_line(),
-        "versions": runtime.versions(),
+        **runtime.made_by(),
         "total_s": time.monotonic() - start,
     }
-    path = folder / BENCHMARK
-    write_json(path, result)
-    tables = benchmark_tables(path)
-    page = write_result_page(path, tables, "How fast bavs_jax is")
-    print(f"{collected_text(tables)}\nnumbers: {path}\npage:    {page}")
+    write_result(folder / BENCHMARK, result, "How fast bavs_jax is")
     if FLAGS.profile:
         print(f"trace:   {folder / 'trace'}, for Perfetto or TensorBoard")
 

@@ -1,7 +1,5 @@
 """From a config to a scene, its first views and candidates, and all that a run needs of it."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from functools import cache, cached_property, partial
@@ -14,9 +12,11 @@ from jax.sharding import Mesh
 from bavs_jax import pools
 from bavs_jax.active import Acquisition, ActiveState
 from bavs_jax.candidates import (
+    candidate_cameras,
     captured_candidates,
     dataset_candidates,
     reachable_candidates,
+    scene_hemisphere,
     with_empty_views,
 )
 from bavs_jax.devices import num_shards, put_on_all
@@ -26,10 +26,13 @@ from bavs_jax.models.base import RadianceModel
 from bavs_jax.pixel_table import make_pixel_table, num_training_pixels
 from bavs_jax.policy_inputs import InputMaker, LookOptions
 from bavs_jax.scenes import Scene, SceneError, load_scene
+from bavs_jax.scenes.pose_files import read_pose_file
+from bavs_jax.scenes.poses import transform_poses
 from bavs_jax.scenes.procedural import capture, subject
 from bavs_jax.scenes.zoom import Zoom
 from bavs_jax.selection.distances import Radii
 from bavs_jax.selection.policies import get_policy
+from bavs_jax.target_inputs import GAP_TARGETS, MakeTargets
 from bavs_jax.training.fit import Trainer, is_stuck, single_colour_error
 from bavs_jax.training.train import TrainInfo, TrainState
 from bavs_jax.uncertainty.channel import make_render_chunk_fn
@@ -48,10 +51,10 @@ from experiments.build_model import (
     only,
     train_aside,
 )
-from experiments.build_targets import build_targets
 from experiments.runtime import ConfigError
 from experiments.runtime import track as show_progress
 
+TARGET_KINDS = ("pool", "hemisphere", "file")
 MAX_NEW_PIXELS = 1 << 30  # of pictures taken on the way, for which room is made at the start
 
 # The streams of randomness of a run: one key for each purpose, all of them from its seed. The key
@@ -177,6 +180,29 @@ def check_shards(config, mesh: Mesh | None) -> None:
                 f"{name}: {num} pixels at once cannot be spread over {num_shards(mesh)} devices: "
                 "take a number of --devices that divides them"
             )
+
+
+def build_targets(config, scene: Scene) -> MakeTargets:
+    """Makes the target views of a scene, with the lens and the image size of its photos.
+
+    Poses of a file are fixed, those on the hemisphere are drawn anew in each round.
+
+    Raises:
+      SceneError: a file of poses that cannot be used.
+    """
+    kind = config.targets.kind
+    if kind == "hemisphere":
+        num = config.targets.num or GAP_TARGETS
+        return lambda key: candidate_cameras(scene, scene_hemisphere(key, scene, num))
+    if kind == "file":
+        try:
+            poses = read_pose_file(config.targets.poses_file)
+        except SceneError as error:
+            raise SceneError(f"config.targets.poses_file: {error}") from error
+        poses = transform_poses(np.linalg.inv(scene.user_from_scene), poses)
+        cameras = candidate_cameras(scene, poses)
+        return lambda key: cameras
+    return lambda key: None
 
 
 # --- all of it together ----------------------------------------------------------------------

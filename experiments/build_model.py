@@ -1,7 +1,5 @@
 """From a config and a scene to a field, its sampler, the model of both, and how it is trained."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
@@ -173,12 +171,7 @@ def _build_sampler(config, scene: Scene, kind: str) -> Sampler:
 
 
 def build_model(
-    config,
-    scene: Scene,
-    num_views: int,
-    kind: str,
-    flow: FlowField,
-    mesh: Mesh | None = None,
+    config, scene: Scene, num_views: int, kind: str, flow: FlowField, mesh: Mesh | None = None
 ) -> RayField:
     """The model of one of `KINDS`; compiles nothing yet.
 

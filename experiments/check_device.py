@@ -10,16 +10,14 @@ fewer digits on some accelerators; JAX_DEFAULT_MATMUL_PRECISION=highest in the e
 all of them.
 """
 
-from __future__ import annotations
-
 import sys
 
 import jax
 from absl import flags
 
-from experiments import runtime
-from experiments.bench import same_numbers
+from experiments import runtime, stages
 from experiments.files import write_json
+from experiments.reporting.result_tables import DEVICE_FILE, differences_table
 from experiments.reporting.tables import markdown
 from experiments.runtime import ConfigError
 
@@ -31,7 +29,7 @@ flags.DEFINE_list("fields", [], "Which fields to check; all of them if left out.
 
 def main() -> None:
     folder = runtime.given_folder("workdir", "a folder for the results")
-    known = [*same_numbers.FIELDS]
+    known = [*stages.FIELDS]
     if unknown := sorted({*FLAGS.fields} - {*known}):
         raise ConfigError(f"--fields: unknown {unknown}; known: {', '.join(known)}")
     device = jax.devices()[0]
@@ -40,22 +38,20 @@ def main() -> None:
             "JAX_PLATFORMS: JAX sees no device but the CPU, so there is nothing to compare; "
             "install JAX for the accelerator"
         )
-    path, found, wrong = folder / same_numbers.DEVICE_FILE, {}, []
+    path, found, wrong = folder / DEVICE_FILE, {}, []
     for name in FLAGS.fields or known:
-        found[name] = same_numbers.check_field(name, device, jax.devices("cpu")[0])
-        wrong = same_numbers.too_large(found, FLAGS.tolerance)
+        found[name] = stages.check_field(name, device, jax.devices("cpu")[0])
+        wrong = stages.too_large(found, FLAGS.tolerance)
         result = {
             "schema_version": 1,
-            "device": runtime.device_name(),
+            **runtime.made_by(),
             "matmul_precision": str(jax.config.jax_default_matmul_precision or "default"),
             "tolerance": FLAGS.tolerance,
             "differences": found,
             "above_tolerance": wrong,
-            "command": runtime.command_line(),
-            "versions": runtime.versions(),
         }
         write_json(path, result)
-    print(f"numbers: {path}\n{markdown(same_numbers.differences_table(found))}")
+    print(f"numbers: {path}\n{markdown(differences_table(found))}")
     if wrong:
         sys.exit(f"error: {runtime.device_name()} differs from the CPU in {'; '.join(wrong)}")
 

@@ -9,8 +9,6 @@ WORKDIR/cleanup.json, with the measures at every threshold that was tried, and t
 after into WORKDIR/<policy>/seed_<n>/cleanup/views.png.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 
@@ -28,9 +26,8 @@ from bavs_jax.uncertainty.cleanup import (
     make_cleaned_render_fn,
     threshold_sigma,
 )
-from experiments import runtime
+from experiments import posthoc, runtime
 from experiments.evaluate import evenly_spaced
-from experiments.posthoc import script
 from experiments.reporting.pictures import Panel, panel_table, psnr_words
 from experiments.reporting.plots import save_figure
 from experiments.trained import TrainedRun
@@ -38,7 +35,7 @@ from experiments.trained import TrainedRun
 NUM_PICTURES = 4
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(script)
+posthoc.define_flags()
 flags.DEFINE_enum("rule", RULES[0], RULES, "How the threshold is chosen from the training views.")
 flags.DEFINE_float("max_loss", 0.1, "Rule quality: dB that the training views may lose.", 0.0)
 flags.DEFINE_float("keep", 0.99, "Rule keep: share of their content that stays.", 1e-6, 1.0)
@@ -129,7 +126,7 @@ def views_figure(run: TrainedRun, cleaned_fn: Callable, view_ids) -> Figure:
 
 
 def main() -> None:
-    script.measure_runs(clean_run, "cleanup.json")
+    posthoc.measure_runs(clean_run, "cleanup.json")
 
 
 if __name__ == "__main__":

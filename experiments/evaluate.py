@@ -1,19 +1,11 @@
 """How good a field is on test views, and how good pictures without any field would be."""
 
-from __future__ import annotations
-
 import jax
 import numpy as np
 from PIL import Image
 
 from bavs_jax.cameras import num_pixels
-from bavs_jax.metrics.image import (
-    depth_mae,
-    match_exposure,
-    measure_images,
-    psnr,
-    quantise_uint8,
-)
+from bavs_jax.metrics.image import depth_mae, match_exposure, measure_images, psnr, quantise_uint8
 from bavs_jax.rendering.images import render_views
 from experiments.build_model import RENDER_CHUNK
 from experiments.files import stack_pictures
@@ -81,16 +73,13 @@ def evaluate_views(
     exposure: bool = False,
     progress_fn=None,
 ) -> dict:
-    """Mean image measures over views by the 8-bit protocol, and the mean depth error.
+    """Mean image measures over views [n] by the 8-bit protocol, and the mean depth error.
 
     Args:
       render_fn: `Rays` [chunk] -> dict with "rgb", "depth", "opacity" and "thinned".
-      scene: the scene with the true images.
-      view_ids: [n] which views.
       rays_per_pixel: see `render_views`; as many as the field was trained with.
       lpips_fn: see `measure_images`.
       exposure: whether to measure `psnr_exposure`, too.
-      progress_fn: called with the number of rays done.
 
     Returns:
       dict of `psnr` (dB), `ssim`, `lpips`, `depth_mae` (scene units), `num_test_views`, `thinned`

@@ -9,13 +9,10 @@ Started again it goes on with what is missing, also in a folder of `experiments.
 with the same config.
 """
 
-from __future__ import annotations
-
 import pathlib
 import time
 
 from absl import flags
-from ml_collections import config_flags
 
 from experiments import runtime
 from experiments.build import Problem, check_views, load_config_scene
@@ -25,13 +22,7 @@ from experiments.uncertainty import measure_seed, write_summary
 
 FLAGS = flags.FLAGS
 runtime.define_cache_flags()
-config_flags.DEFINE_config_file(
-    "config",
-    None,
-    "What to measure, such as experiments/configs/uncertainty.py; every option is explained in "
-    "experiments/configs/base.py and can be set as --config.name=value.",
-    lock_config=True,
-)
+runtime.define_config_flag("What to measure, such as experiments/configs/uncertainty.py")
 flags.DEFINE_string("workdir", None, "Folder for fields, uncertainty.json and uncertainty.html.")
 
 

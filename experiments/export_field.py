@@ -16,8 +16,6 @@ Needs `pip install 'bavs_jax[export]'`. For density, sigma and colour at points 
 `TrainedRun.point_fn` in experiments/trained.py.
 """
 
-from __future__ import annotations
-
 import pathlib
 from collections.abc import Callable
 from functools import partial
@@ -42,11 +40,10 @@ from bavs_jax.scenes import Scene
 from bavs_jax.scenes.poses import user_points, user_units
 from bavs_jax.scenes.sdf_surface import sample_surface
 from bavs_jax.uncertainty.channel import finish_uncertainty
-from experiments import runtime
+from experiments import posthoc, runtime
 from experiments.build import stream_key, true_surface
 from experiments.build_model import RENDER_CHUNK
 from experiments.files import write_arrays, write_atomic
-from experiments.posthoc import script
 from experiments.reporting.result_tables import geometry_table
 from experiments.reporting.tables import markdown
 from experiments.runtime import ConfigError, track
@@ -64,7 +61,7 @@ VOLUMES = {  # name of the file: what it holds, and its unit in the user's coord
 NEEDED = {"grid": ["nrrd"], "points": ["trimesh"], "mesh": ["trimesh", "skimage.measure"]}
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(script)
+posthoc.define_flags()
 flags.DEFINE_list("what", list(NEEDED), f"What to write, of {','.join(NEEDED)}.")
 flags.DEFINE_integer("resolution", 128, "Grid points along the longest side of the box.", 2, 1024)
 THRESHOLD = (
@@ -169,7 +166,7 @@ def write_mesh(folder: pathlib.Path, run: TrainedRun, axes, density, point_fn: C
         options = {"density_threshold": threshold, "min_part": FLAGS.min_part}
         errors = measure_geometry(run, mesh, signed_distance)
         rows = [{"resolution": FLAGS.resolution, **options, **errors}]
-        script.write_rows(folder / "geometry.json", run, rows)
+        posthoc.write_rows(folder / "geometry.json", run, rows)
         print(f"geometry: {folder / 'geometry.json'}\n{markdown(geometry_table(rows))}")
 
 
@@ -204,7 +201,7 @@ def main() -> None:
         raise ConfigError(f"--what: {what} cannot be used: give some of {','.join(NEEDED)}")
     for module in [module for name in what for module in NEEDED[name]]:
         import_extra(module)  # one that is missing ends here, before anything is computed
-    for run in script.trained_runs():
+    for run in posthoc.trained_runs():
         export_run(run)
 
 

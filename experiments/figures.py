@@ -6,8 +6,6 @@ Writes to WORKDIR/figures each measure against training views (Figure 6: psnr.pd
 with their uncertainty (Figure 8: views.pdf), from the result files alone.
 """
 
-from __future__ import annotations
-
 from absl import flags
 
 from experiments import runtime

@@ -1,9 +1,6 @@
 """Files that are written whole or not at all, and what the folder of an experiment holds."""
 
-from __future__ import annotations
-
 import contextlib
-import copy
 import errno
 import fcntl
 import json
@@ -231,7 +228,7 @@ class Part(NamedTuple):
         return f"{self.policy or first}/seed_{self.seed}"
 
     @property
-    def initial(self) -> Part:
+    def initial(self) -> "Part":
         """The part that makes the round 0 it starts from."""
         return self._replace(policy=None)
 
@@ -275,26 +272,23 @@ def leaves(config, prefix: str = "") -> dict:
     return found
 
 
-# What values of options were called in earlier versions, and what is read in place of it.
-OLD_VALUES: dict[str, dict] = {
-    "uncertainty.weighting": {
-        "eq13": "gauss_newton",
-        "eq11": "residual_weighted",
-        "empirical": "empirical_fisher",
-    },
-    "data_dir": {"": None},
-    "load.split": {"": None},
-    "sampler_kind": {"": None},
-    "candidates.mode": {"": None},
-    "load.downscale": {0: None},
-    "load.pool_size": {0: None},
-    "load.test_every": {0: None},
-    "train.learning_rate": {0: None},
-    "uncertainty.prior_weight": {0: None},
-    "candidates.min_train_distance": {0: None},
-    "candidates.min_candidate_distance": {0: None},
-    "view_seed": {"": None},
+# What stood for the default in earlier versions, and is read as None.
+WAS_NONE = {
+    "": ("data_dir", "load.split", "sampler_kind", "candidates.mode", "view_seed"),
+    0: (
+        *("load.downscale", "load.pool_size", "load.test_every", "train.learning_rate"),
+        *("candidates.min_train_distance", "candidates.min_candidate_distance"),
+        "uncertainty.prior_weight",
+    ),
 }
+# What values of options were called, and what is read in place of it.
+OLD_VALUES: dict[str, dict] = {option: {old: None} for old in WAS_NONE for option in WAS_NONE[old]}
+OLD_VALUES["uncertainty.weighting"] = dict(
+    eq13="gauss_newton", eq11="residual_weighted", empirical="empirical_fisher"
+)
+
+
+GONE = ("predict_gain",)  # options that changed neither a field nor a choice
 
 
 def modern_value(option: str, value):
@@ -304,22 +298,17 @@ def modern_value(option: str, value):
 
 
 def modern(saved: dict) -> dict:
-    """A `config.json` of an earlier version in the words of this one."""
-    saved = copy.deepcopy(saved)
-    if "field" in saved:
-        saved["hash_grid"] = saved.pop("field")
-    for option in OLD_VALUES:
-        *groups, name = option.split(".")
-        group = saved
-        for part in groups:
-            group = group.get(part, {})
-        if name in group:
-            group[name] = modern_value(option, group[name])
-    if type(saved.get("view_seed")) is str:  # a seed was written as text
-        saved["view_seed"] = int(saved["view_seed"])
-    for group in ("pool", "targets"):  # what all did before they could be asked otherwise
-        saved.setdefault(group, base.get_config()[group].to_dict())
-    return saved
+    """Options of a `config.json` by their dotted names, in the words of this version."""
+    groups = {name: base.get_config()[name].to_dict() for name in ("pool", "targets")}
+    options = {}
+    # Without these groups all did what is their default; the hash grid was called `field`.
+    for option, value in leaves(groups | saved).items():
+        name = option.replace("field.", "hash_grid.") if option.startswith("field.") else option
+        if name not in GONE:
+            options[name] = modern_value(name, value)
+    if type(options.get("view_seed")) is str:  # a seed was written as text
+        options["view_seed"] = int(options["view_seed"])
+    return options
 
 
 def check_claim(workdir: pathlib.Path, config) -> None:
@@ -336,7 +325,7 @@ def check_claim(workdir: pathlib.Path, config) -> None:
             f"{error}: delete it if the runs there are of this config, and start again; or use "
             "another --workdir"
         ) from error
-    old, new = ({k: json.dumps(v) for k, v in leaves(c).items()} for c in (before, config))
+    old, new = ({k: json.dumps(v) for k, v in c.items()} for c in (before, leaves(config)))
     for option, _ in sorted(old.items() ^ new.items()):
         if option not in EXTENSIBLE:
             raise WorkdirError(

@@ -8,18 +8,15 @@ it is, and what they do not settle moves: WORKDIR/draws.json says how far pixels
 views and in test views, and WORKDIR/<policy>/seed_<n>/draws/draws.png shows it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from absl import flags
 from matplotlib.figure import Figure
 
 from bavs_jax.fields.deformation import cell_sides
 from bavs_jax.uncertainty.draws import colour_deviation
-from experiments import runtime
+from experiments import posthoc, runtime
 from experiments.evaluate import evenly_spaced
-from experiments.posthoc import script
-from experiments.posthoc.draws import draw_views, farthest_view, spread_measures
+from experiments.posthoc import draw_views, farthest_view, spread_measures
 from experiments.reporting.pictures import Panel, panel_table
 from experiments.reporting.plots import save_figure
 from experiments.trained import TrainedRun
@@ -27,7 +24,7 @@ from experiments.trained import TrainedRun
 NUM_SHOWN = 3  # draws in the picture
 
 FLAGS = flags.FLAGS
-flags.adopt_module_key_flags(script)
+posthoc.define_flags()
 flags.DEFINE_integer("num_draws", 16, "Offsets drawn from the posterior.", 2, 1024)
 flags.DEFINE_integer("num_views", 8, "Rendered training views, and as many test views.", 1)
 SCALE = "Temperature of the draws; 0: what the training views' error says of the noise."
@@ -82,7 +79,7 @@ def draws_figure(run: TrainedRun, training_view: dict, far_view: dict) -> Figure
 
 
 def main() -> None:
-    script.measure_runs(draw_run, "draws.json")
+    posthoc.measure_runs(draw_run, "draws.json")
 
 
 if __name__ == "__main__":

@@ -7,13 +7,11 @@ result.json and the folder's summary. What was measured then must come out again
 files of another scene are noticed. What has been measured by the same network is left alone.
 """
 
-from __future__ import annotations
-
 from absl import flags
 
 from bavs_jax.metrics.perceptual import NETS
 from experiments import runtime
-from experiments.posthoc.lpips import remeasure
+from experiments.posthoc import remeasure
 
 FLAGS = flags.FLAGS
 runtime.define_cache_flags()

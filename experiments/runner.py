@@ -1,7 +1,5 @@
 """A policy with a seed, from its last checkpoint to its result file; and all runs of a config."""
 
-from __future__ import annotations
-
 import pathlib
 import time
 from functools import partial
@@ -27,12 +25,7 @@ from experiments.build import (
     stream_key,
 )
 from experiments.build_model import train_with_bar
-from experiments.choices import (
-    acquisition_arrays,
-    load_choices,
-    save_choice,
-    write_next_views,
-)
+from experiments.choices import acquisition_arrays, load_choices, save_choice, write_next_views
 from experiments.files import Part, write_arrays, write_json
 from experiments.reporting.report import write_report
 from experiments.reporting.results import bound_words
@@ -61,7 +54,7 @@ class Run:
         self.pending = _new_pending()  # what is known of the round under way
         self.checkpoints = Checkpoints(self.folder / "checkpoints", warn_fn=warn)
 
-    def finish(self, shared: Run | None = None) -> None:
+    def finish(self, shared: "Run | None" = None) -> None:
         """Goes on from the last checkpoint to the last round and writes all files of the run.
 
         Without a checkpoint it goes on from the finished run of round 0 that is `shared`.
@@ -179,7 +172,7 @@ class Run:
         train = self.problem.trainer.init(stream_key(self.seed, "init"))
         return active.init(train, self.problem.table, self.initial)
 
-    def _restored(self, run: Run) -> ActiveState | None:
+    def _restored(self, run: "Run") -> ActiveState | None:
         """The state of a run's last checkpoint, from where this one goes on; None without one."""
         found = run.checkpoints.restore(saved_part(self.problem, self._fresh()))
         if found is None:

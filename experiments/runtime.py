@@ -1,7 +1,5 @@
 """What every script needs: errors in one line, flags, caches, progress, and what it runs on."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import importlib.metadata
@@ -10,24 +8,20 @@ import os
 import pathlib
 import platform
 import resource
-import socket
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 
 import jax
 import numpy as np
 from absl import app, flags, logging
 from jax.experimental import multihost_utils
-from jax.sharding import Mesh
+from ml_collections import config_flags
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from bavs_jax.devices import make_mesh
 from bavs_jax.export.formats import ExportError
 from bavs_jax.placement.collect import PlacementError
 from bavs_jax.scenes import SceneError
@@ -144,20 +138,6 @@ def command_line() -> str:
     return " ".join([name, *sys.argv[1:]])
 
 
-def end_with_parent() -> None:
-    """Ends this process as soon as its standard input is closed.
-
-    A program that starts this one through a pipe takes it along even when it is killed.
-    """
-
-    def watch():
-        while os.read(sys.stdin.fileno(), 1024):
-            pass
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 def given_folder(flag: str, hint: str, *, exists: bool = False) -> pathlib.Path:
     """The folder that a flag names, which can be made or, if it `exists` already, read.
 
@@ -178,6 +158,14 @@ def given_folder(flag: str, hint: str, *, exists: bool = False) -> pathlib.Path:
         why = f"{shown(text)} cannot be used ({reason(error)})"
         raise ConfigError(f"--{flag}: {why}; name {hint}") from None
     return path
+
+
+def define_config_flag(what: str, default: str | None = None) -> None:
+    """Gives a script the flag of its config: `what` that is, with the file of a default."""
+    text = f"{what}; options are explained in experiments/configs/base.py, set as "
+    config_flags.DEFINE_config_file(
+        "config", default, f"{text}--config.name=value.", lock_config=True
+    )
 
 
 # --- caches ----------------------------------------------------------------------------------
@@ -218,12 +206,8 @@ def use_compilation_cache(folder: pathlib.Path) -> None:
 def define_cache_flags() -> None:
     """Gives a script the flags of the compilation cache, which it keeps by default."""
     flags.DEFINE_bool("compilation_cache", True, "Keep compiled programs for the next start.")
-    flags.DEFINE_string(
-        "compilation_cache_dir",
-        "",
-        "Folder of compiled programs; by default $XDG_CACHE_HOME/bavs_jax/compiled, or the same in "
-        "~/.cache.",
-    )
+    text = "Their folder, $XDG_CACHE_HOME/bavs_jax/compiled or in ~/.cache by default."
+    flags.DEFINE_string("compilation_cache_dir", "", text)
 
 
 def start_cache() -> None:
@@ -234,7 +218,7 @@ def start_cache() -> None:
         use_compilation_cache(folder if given else folder / "compiled")
 
 
-# --- devices and processes -------------------------------------------------------------------
+# --- processes that work together ------------------------------------------------------------
 
 
 def is_first_process() -> bool:
@@ -247,74 +231,6 @@ def as_first_process(value: bool) -> bool:
     if not jax.distributed.is_initialized():
         return value
     return bool(multihost_utils.broadcast_one_to_all(np.array(value)))
-
-
-def define_device_flags() -> None:
-    """Gives a script the flags of `start_devices`."""
-    of_first = "With --coordinator: "
-    flags.DEFINE_integer("devices", 1, "Devices that share the rays of a run; 0: all.", 0)
-    flags.DEFINE_string(
-        "coordinator", "", "host:port of the first of several processes; they use all devices."
-    )
-    flags.DEFINE_integer("num_processes", 1, f"{of_first}how many processes there are.", 1)
-    flags.DEFINE_integer("process_id", 0, f"{of_first}which one this is, from 0 on.", 0)
-    flags.DEFINE_integer("join_seconds", 300, f"{of_first}how long to wait for all.", 1, 86400)
-
-
-def start_devices() -> Mesh | None:
-    """Joins the other processes, says which devices are used, and makes their mesh.
-
-    With `--coordinator` the same command is started once for each process, on machines that share
-    the working folder: all of them compute, the first one prints and writes. Must come before
-    anything is computed. Raises ConfigError for flags that cannot be used.
-    """
-    if not FLAGS.coordinator and FLAGS.num_processes != 1:
-        raise ConfigError("--num_processes: needs --coordinator, the host:port of the first one")
-    if FLAGS.coordinator:
-        _join_processes(FLAGS.coordinator, FLAGS.num_processes, FLAGS.process_id)
-    try:
-        mesh = make_mesh(0 if FLAGS.coordinator else FLAGS.devices)
-    except ValueError as error:
-        raise ConfigError(
-            f"--devices: {error}; on a CPU, XLA_FLAGS=--xla_force_host_platform_device_count=N "
-            "makes N of them"
-        ) from None
-    devices = jax.devices()[:1] if mesh is None else mesh.devices.ravel().tolist()
-    kinds = Counter(device.device_kind for device in devices)
-    of = f", of {FLAGS.num_processes} processes" if FLAGS.num_processes > 1 else ""
-    print(f"devices: {', '.join(f'{num} x {kind}' for kind, num in kinds.items())}{of}")
-    return mesh
-
-
-def _join_processes(address: str, num: int, number: int) -> None:
-    if not 0 <= number < num:
-        raise ConfigError(
-            f"--process_id: {number} is not below --num_processes, {num}; number them from 0 on"
-        )
-    host, _, port = address.rpartition(":")
-    try:
-        if not host or not 0 < int(port) < 65536:
-            raise ValueError
-        socket.getaddrinfo(host.strip("[]"), int(port))
-    except (ValueError, OSError):
-        raise ConfigError(
-            f"--coordinator: {shown(address)} is no host:port that is known here; give that of the "
-            "first process, such as 10.0.0.1:1234"
-        ) from None
-
-    def give_up():  # before JAX does, which dumps its stack
-        reason = f"after {FLAGS.join_seconds} s not all {num} processes have met at {address}"
-        print(f"error: --coordinator: {reason}", file=sys.stderr, flush=True)
-        os._exit(1)
-
-    timer = threading.Timer(FLAGS.join_seconds, give_up)
-    timer.daemon = True
-    timer.start()
-    patience = FLAGS.join_seconds + 60
-    jax.distributed.initialize(address, num, number, initialization_timeout=patience)
-    timer.cancel()
-    if number > 0:
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115, open as long as the process is
 
 
 # --- progress --------------------------------------------------------------------------------
@@ -389,6 +305,11 @@ def track(
 
 
 # --- what a result was made on ---------------------------------------------------------------
+
+
+def made_by() -> dict:
+    """What every result file says of how it was made."""
+    return {"command": command_line(), "device": device_name(), "versions": versions()}
 
 
 def versions() -> dict[str, str]:

@@ -1,7 +1,5 @@
 """What every option of experiments/configs/base.py may be, checked before any work is done."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from functools import partial
@@ -23,8 +21,8 @@ from bavs_jax.uncertainty.channel import EXTENTS, SCALES, VARIANTS
 from bavs_jax.uncertainty.conformal_scale import SCALES as INTERVAL_SCALES
 from bavs_jax.uncertainty.curvature import WEIGHTINGS
 from bavs_jax.uncertainty.models import MODELS
+from experiments.build import TARGET_KINDS
 from experiments.build_model import SAMPLERS
-from experiments.build_targets import TARGET_KINDS
 from experiments.files import leaves, modern_value
 from experiments.runtime import ConfigError, one_line, shown
 
@@ -177,15 +175,14 @@ _OPTIONS_OF_A_KIND = {
     "hash_grid.num_levels proposal.num_levels": whole(1, 32),
     "hash_grid.coarsest hash_grid.finest proposal.coarsest march.num_steps": whole(1, 65536),
     "hash_grid.log2_table_size proposal.log2_table_size": whole(1, 24),  # 16 million rows
-    "hash_grid.features hash_grid.geometry_features": whole(1, 4096),
-    "hash_grid.width nerf_mlp.width mip_mlp.width mip_mlp.proposal_width": whole(1, 4096),
-    "proposal.width flow.condition_features march.num_slots": whole(1, 4096),
-    "coarse_to_fine.num_coarse coarse_to_fine.num_fine proposal.num_samples": whole(1, 4096),
+    """hash_grid.features hash_grid.geometry_features hash_grid.width nerf_mlp.width mip_mlp.width
+    mip_mlp.proposal_width proposal.width flow.condition_features march.num_slots
+    coarse_to_fine.num_coarse coarse_to_fine.num_fine proposal.num_samples""": whole(1, 4096),
     "hash_grid.direction_degree": whole(1, 4),
     "hash_grid.appearance_features": whole(1, 1024, "none"),
     "nerf_mlp.depth mip_mlp.depth mip_mlp.proposal_depth flow.num_flows": whole(1, 64),
-    "nerf_mlp.position_degree nerf_mlp.direction_degree": whole(1, 24),
-    "mip_mlp.position_degree mip_mlp.direction_degree": whole(1, 24),
+    """nerf_mlp.position_degree nerf_mlp.direction_degree mip_mlp.position_degree
+    mip_mlp.direction_degree""": whole(1, 24),
     "flow_training.num_draws uncertainty.flow_draws": whole(2, 1024),
     "march.occupancy_resolution": whole(1, 512),
     "uncertainty.log2_cells": whole(1, MAX_LOG2_CELLS, note=GRID_MEMORY),
@@ -195,12 +192,10 @@ _OPTIONS_OF_A_KIND = {
     "candidates.min_train_distance candidates.min_candidate_distance": default(
         positive(MAX_VALUE), "those that leave candidates.survivors"
     ),
-    "candidates.image_scale candidates.survivors": positive(1.0),
-    "train.final_share train.adam_eps": positive(1.0),
+    "candidates.image_scale candidates.survivors train.final_share train.adam_eps": positive(1.0),
     "hash_grid.initial_optical_depth": number(1e-6, 1e3),
-    "flow_training.entropy_weight train.penalty_weight": number(0.0, 1e6),
-    "proposal.interlevel_weight proposal.distortion_weight": number(0.0, 1e6),
-    "proposal.penalty_weight": number(0.0, 1e6),
+    """flow_training.entropy_weight train.penalty_weight proposal.interlevel_weight
+    proposal.distortion_weight proposal.penalty_weight""": number(0.0, 1e6),
     "flow_training.floor uncertainty.offset_cells": positive(1e3),
     "proposal.far": positive(MAX_VALUE),
     "train.one_ray_share": number(0.0, 1.0),

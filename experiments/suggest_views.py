@@ -7,8 +7,6 @@ clear of matter and within bounds. Poses are written in the coordinates of the u
 The same command goes on with a run that was stopped; with other candidates it uses the same field.
 """
 
-from __future__ import annotations
-
 import pathlib
 import time
 from functools import partial

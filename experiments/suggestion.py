@@ -1,7 +1,5 @@
 """Free camera poses around a capture, and the batch of them that a policy chooses by its field."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from functools import partial

@@ -10,8 +10,6 @@ ablations do. Started again, a sweep goes on: what is finished is not run again.
 While it runs, no other sweep may start in its folder.
 """
 
-from __future__ import annotations
-
 import contextlib
 import pathlib
 import sys
@@ -20,17 +18,14 @@ from collections import Counter
 from absl import flags
 from ml_collections import config_flags
 
-from bavs_jax.training.fit import MAX_RESTARTS
-from experiments import files, runtime
+from experiments import files, jobs, runtime
+from experiments import sweep_plan as plan
 from experiments.reporting.report import write_report
 from experiments.schema import check_config, given_config
-from experiments.sweeps import jobs, plan
 
 FLAGS = flags.FLAGS
 runtime.define_cache_flags()
-config_flags.DEFINE_config_file(
-    "config", None, "What to run; see experiments.active_selection.", lock_config=True
-)
+runtime.define_config_flag("What to run")
 flags.DEFINE_string("workdir", None, "Folder for all results.")
 flags.DEFINE_multi_string(
     "axis", [], "What to vary: name=value,value or seed=0:5; may be repeated."
@@ -79,37 +74,12 @@ def claim_folders(settings: list[plan.Setting], folder: pathlib.Path) -> plan.Re
     return record
 
 
-def num_rounds(trial: plan.Trial) -> int:
-    """That a trial has to train; round 0 is a trial of its own."""
-    return trial.setting.config.num_rounds if trial.part.policy else 1
-
-
-def rounds_done(trial: plan.Trial) -> float:
-    """How many of them are trained, by the number of the last checkpoint (see `Run._save`)."""
-    train = trial.setting.config.train
-    num_calls = -(-train.num_steps // train.steps_per_call)
-    folder = trial.setting.folder / trial.part.name / "checkpoints"
-    number = max((int(p.name) for p in folder.glob("*") if p.name.isdigit()), default=0)
-    attempt, calls = divmod(number, num_calls + 2)
-    done = attempt // (MAX_RESTARTS + 1) + min(calls / num_calls, 1.0)
-    return max(done - 1.0, 0.0) if trial.part.policy else done
-
-
 def run_trials(trials: list[plan.Trial], record: plan.Record, folder: pathlib.Path) -> int:
     """Runs all trials and shows how far they are together; returns how many failed.
 
     Failures are noted in the record, and struck out when they are made good.
     """
-    done = {trial.name: rounds_done(trial) for trial in trials}
-    states = dict.fromkeys(done, "waiting")
-
-    def steps_done() -> int:
-        for trial in trials:
-            if states[trial.name] in ("finished", "failed"):
-                done[trial.name] = num_rounds(trial)
-            elif states[trial.name] == "started":
-                done[trial.name] = rounds_done(trial)
-        return int(sum(done[t.name] * t.setting.config.train.num_steps for t in trials))
+    states = dict.fromkeys((trial.name for trial in trials), "waiting")
 
     def note_end(trial: plan.Trial, reason: str) -> None:
         name = f"{trial.setting.name}/{trial.part.name}"
@@ -120,10 +90,9 @@ def run_trials(trials: list[plan.Trial], record: plan.Record, folder: pathlib.Pa
             files.collect(trial.setting.folder)
         plan.write_record(folder, record)
 
-    shown = steps_done()
-    total = sum(num_rounds(t) * t.setting.config.train.num_steps for t in trials) - shown
     events = jobs.run_jobs(trials, make_engine(), retries=FLAGS.retries)
-    with contextlib.closing(events), runtime.track(total, f"{len(trials)} processes") as bar:
+    bar = runtime.track(len(trials), "sweep", "processes")
+    with contextlib.closing(events), bar as task:
         for kind, trial, reason in events:
             if trial is not None:
                 states[trial.name] = kind
@@ -131,10 +100,9 @@ def run_trials(trials: list[plan.Trial], record: plan.Record, folder: pathlib.Pa
                     print(f"{trial.name}: {kind}{': ' if reason else ''}{reason}", flush=True)
                 if kind in ("finished", "failed"):
                     note_end(trial, reason)
-            count, now = Counter(states.values()), steps_done()
-            numbers = {"running": count["started"], "finished": count["finished"]}
-            bar.advance(now - shown, **numbers, failed=count["failed"])
-            shown = now
+            count = Counter(states.values())
+            numbers = {"running": count["started"], "failed": count["failed"]}
+            task.advance(kind in ("finished", "failed"), **numbers)
     return count["failed"]
 
 

@@ -10,8 +10,6 @@ names which tables, `policies=bavs,random` which rows, and `paper=table_1` the p
 rows are put beside ours.
 """
 
-from __future__ import annotations
-
 import pathlib
 import re
 import sys
@@ -42,14 +40,8 @@ def result_tables(
 ) -> str:
     """The tables of all result files of a folder, with the commands that made them.
 
-    Args:
-      folder: where the result files are.
-      form: a key of `FORMATS`.
-      names: of the tables; none: all.
-      paper, only: a table of the paper, and the policies that are shown; see `collect_tables`.
-
-    Raises:
-      ReportError: a file that cannot be used, or no such table.
+    Of all `names` of tables if none is given, in a form of `FORMATS`; ReportError if there is no
+    such table. See `collect_tables` for `paper` and `only`.
     """
     found = collect_all(folder, paper, only)
     known = list(dict.fromkeys(name for one in found for name in one.tables))

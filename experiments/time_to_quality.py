@@ -11,8 +11,6 @@ with imports, loading and compilation, and stands while test views are measured.
 scene's photos are made before.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import pathlib
@@ -23,24 +21,21 @@ import time
 
 import jax
 from absl import flags
-from ml_collections import config_flags
 
 from bavs_jax.active import round_keys
 from bavs_jax.training.fit import fit
 from experiments import runtime
-from experiments.bench import results
-from experiments.bench.stages import SEED, Subject
 from experiments.build import load_config_scene, run_key
 from experiments.configs import base
 from experiments.evaluate import evaluate_views, evenly_spaced
 from experiments.files import write_json
-from experiments.reporting.tables import collected_text
+from experiments.reporting import benchmark as results
 from experiments.runtime import ConfigError, shown, track
 from experiments.schema import given_config
+from experiments.stages import SEED, Subject
 
 FLAGS = flags.FLAGS
-CONFIG = "Scene, field and training; see experiments/configs/base.py; set as --config.name=value."
-config_flags.DEFINE_config_file("config", base.__file__, CONFIG, lock_config=True)
+runtime.define_config_flag("Scene, field and training", base.__file__)
 flags.DEFINE_string("workdir", None, "Folder for time_to_quality.json and its page.")
 flags.DEFINE_integer("num_views", 20, "Training views.", 1)
 flags.DEFINE_integer("num_test_views", 25, "Test views, evenly spaced; 0: all.", 0)
@@ -79,11 +74,7 @@ def compare_caches(config, folder: pathlib.Path) -> None:
         "command": runtime.command_line(),
         "versions": runtime.versions(),
     }
-    path = folder / results.QUALITY
-    write_json(path, result)
-    found = results.quality_tables(path)
-    page = results.write_result_page(path, found, "Time to quality")
-    print(f"{collected_text(found)}\nnumbers: {path}\npage:    {page}")
+    results.write_result(folder / results.QUALITY, result, "Time to quality")
 
 
 def run_part(config, folder: pathlib.Path, targets: list[str]) -> None:

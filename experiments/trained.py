@@ -1,7 +1,5 @@
 """A field that a run has trained, taken up from its folder or trained now, and its posterior."""
 
-from __future__ import annotations
-
 import json
 import pathlib
 from collections.abc import Callable
@@ -104,16 +102,12 @@ class TrainedRun(NamedTuple):
 def renewed_config(saved: dict) -> ConfigDict:
     """A config that was saved, unchecked; options that it did not know have their default."""
     config = base.get_config().lock()
-    config.update(modern(saved))
+    config.update_from_flattened_dict(modern(saved))
     return config
 
 
 def saved_config(workdir: pathlib.Path) -> ConfigDict:
-    """The config that a run left in its folder; options that it did not know have their default.
-
-    Raises:
-      WorkdirError: there is none, or one that this version cannot read.
-    """
+    """The config that a run left in its folder; WorkdirError if there is none that can be read."""
     path = workdir / "config.json"
     try:
         config = renewed_config(json.loads(path.read_text(encoding="utf-8")))
@@ -142,17 +136,10 @@ def find_runs(workdir: pathlib.Path) -> list[tuple[str, int]]:
 
 
 def choose_runs(workdir: pathlib.Path, config, policy: str, seed: int | None) -> list:
-    """(policy, seed) of the runs that are asked for.
+    """(policy, seed) of the runs of a policy, or of a folder of first rounds; `seed` None: of all.
 
-    Args:
-      workdir: as given to `experiments.active_selection`.
-      config: of the folder.
-      policy: whose runs, or a folder of first rounds. Empty: the config's first policy, or round 0
-        where that has not been started.
-      seed: which of them; None: all.
-
-    Raises:
-      WorkdirError: there is no such run, or it has no checkpoint yet.
+    Without a policy these are the config's first one's, or round 0 where that has not been started.
+    Raises WorkdirError if there is no such run, or it has no checkpoint yet.
     """
     known = find_runs(workdir)
     first = config.policies[0]
@@ -174,12 +161,9 @@ def field_kind(policy: str) -> str:
 
 
 def load_run(problem: Problem, workdir: pathlib.Path, policy: str, seed: int) -> TrainedRun:
-    """Takes up a run, finished or not, where its last checkpoint is.
+    """Takes up a run of `find_runs`, finished or not, where its last checkpoint is.
 
-    Args:
-      problem: built from the folder's config, for fields of `field_kind(policy)`.
-      workdir: as given to `experiments.active_selection`.
-      policy, seed: one of `find_runs`.
+    The problem is built from the folder's config, for fields of `field_kind(policy)`.
     """
     own = None if policy in FIRST_ROUNDS else policy
     run = Run(problem.config, problem, workdir, own, seed)
@@ -194,12 +178,9 @@ def load_run(problem: Problem, workdir: pathlib.Path, policy: str, seed: int) ->
 def train_run(
     config, problem: Problem, workdir: pathlib.Path, policy: str, seed: int, command: str = ""
 ) -> TrainedRun:
-    """Brings a run to its end from wherever it is, and takes it up there.
+    """Brings a run to its end from wherever it is, and takes it up there; see `load_run`.
 
-    Args:
-      config, problem, workdir, seed: see `load_run`.
-      policy: whose run; `FIRST_ROUND` for round 0 alone.
-      command: kept in its result file.
+    A policy of `FIRST_ROUND` is round 0 alone; the command is kept in the result file.
     """
     first = Run(config, problem, workdir, None, seed, command)
     first.finish()

@@ -4,8 +4,6 @@ Each model and seed leaves files of numbers, arrays and intervals and is not mea
 numbers come last. A calibration can be put around renders of new views.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import pathlib
@@ -19,18 +17,7 @@ import numpy as np
 from bavs_jax.cameras import image_pixels
 from bavs_jax.metrics.ause import ERRORS, Sparsification, mean_sparsification, variant_name
 from bavs_jax.rendering.images import render_pixels
-from bavs_jax.uncertainty.bands import (
-    QUANTITIES,
-    RenderCalibration,
-    add_bands,
-    band_errors,
-    calibrate_renders,
-    calibration_from_json,
-    calibration_to_json,
-    has_band,
-    render_errors,
-    uncertainty_of,
-)
+from bavs_jax.uncertainty import bands
 from bavs_jax.uncertainty.conformal_report import coverage_report, to_json
 from bavs_jax.uncertainty.conformal_scale import ViewGroups, split_views
 from bavs_jax.uncertainty.model import Acquired
@@ -46,7 +33,7 @@ from experiments.files import (
     write_json,
 )
 from experiments.reporting.uncertainty import LEVEL, NAME, RESULT_VERSION, save_result, write_page
-from experiments.runtime import ConfigError, WorkdirError, code_commit, device_name, track, versions
+from experiments.runtime import ConfigError, WorkdirError, code_commit, made_by, track
 from experiments.trained import FIRST_ROUND, train_run
 
 ROW_VERSION = 3  # of one model and seed; rows of another version are made anew
@@ -102,7 +89,7 @@ def measure_seed(config, problem: Problem, folder: pathlib.Path, seed: int, comm
         if config.num_pictures:
             shown = evenly_spaced(np.arange(len(view_ids)), config.num_pictures)
             pictures = [images[i] for i in shown]
-            halves = [add_bands(calibration, image, LEVEL)["rgb_half"] for image in pictures]
+            halves = [bands.add_bands(calibration, image, LEVEL)["rgb_half"] for image in pictures]
             arrays |= image_arrays(scene, view_ids[shown], pictures)
             arrays["half"] = stack_pictures(halves)
         path = row_path(folder, name, seed)
@@ -149,10 +136,9 @@ def write_summary(config, scene, folder: pathlib.Path, command: str) -> tuple:
         "kind": config.loader,
         "image_size": np.asarray(scene.cameras.sizes).max(axis=0).tolist(),
         "seeds": list(seeds),
-        "command": command,
         "config": config.to_dict(),
-        "device": device_name(),
-        "versions": versions(),
+        **made_by(),
+        "command": command,
         "pixel_rule": rule,
         # The same for all models of a seed.
         "interval_views": {str(row["seed"]): row.pop("interval_views") for row in rows},
@@ -237,8 +223,8 @@ def pixel_errors(views: list[ViewSample], *, scale_depth: bool) -> dict[str, lis
     ]
     factor = depth_factor(views) if scale_depth else 1.0
     depth = [
-        render_errors("depth", view.image, view.truth["depth"], view.known, depth_factor=factor)
-        for view in views
+        bands.render_errors("depth", v.image, v.truth["depth"], v.known, depth_factor=factor)
+        for v in views
     ]
     largest = max(np.max(view.truth["depth"], where=view.known, initial=0.0) for view in views)
     if largest == 0.0:
@@ -263,7 +249,7 @@ def all_ause(errors: dict[str, list], images: list[dict]) -> dict[str, Sparsific
     found = {}
     for (of, parts), error, pooled in itertools.product(errors.items(), ERRORS, (False, True)):
         pairs = [
-            (values[known], uncertainty_of(of, image).ravel()[known])
+            (values[known], bands.uncertainty_of(of, image).ravel()[known])
             for (values, known), image in zip(parts, images)
             if known.any()
         ]
@@ -277,7 +263,7 @@ def all_ause(errors: dict[str, list], images: list[dict]) -> dict[str, Sparsific
 
 def measure_intervals(
     config, scene, fitted: FittedModel, acquired: Acquired, folder, model: str, seed: int
-) -> tuple[RenderCalibration, dict, float]:
+) -> tuple[bands.RenderCalibration, dict, float]:
     """Calibrates intervals, writes their file and measures them; and the seconds of rendering."""
     options, start = config.evaluation, time.perf_counter()
     groups = interval_groups(scene, acquired.is_training_view, options.num_interval_views, seed)
@@ -291,7 +277,7 @@ def measure_intervals(
     names = {part: [scene.names[view] for view in group] for part, group in views.items()}
     about = {"scene": scene.name, "model": model, "seed": seed, "views": names}
     values = {"schema_version": CALIBRATION_VERSION, **about, "pixels_per_view": num}
-    values["calibration"] = calibration_to_json(calibration)
+    values["calibration"] = bands.calibration_to_json(calibration)
     write_json(row_path(folder, model, seed).with_name(f"seed_{seed}_calibration.json"), values)
     return calibration, {"intervals": numbers, "interval_views": views}, seconds
 
@@ -349,7 +335,7 @@ def sample_views(
 
 def calibrate_samples(
     groups: ViewGroups, samples: dict[int, ViewSample], *, scale: str, scale_depth: bool
-) -> tuple[RenderCalibration, dict]:
+) -> tuple[bands.RenderCalibration, dict]:
     """Learns intervals on two groups of views, as `fit_scale` does, and measures them on the third.
 
     If `scale_depth`, rendered depth is multiplied by the `depth_factor` of the fit views.
@@ -362,26 +348,25 @@ def calibrate_samples(
     fit, calibrating, test = ([samples[int(view)] for view in views] for views in groups)
     factor = depth_factor(fit) if scale_depth else 1.0
 
-    def errors_of(fn, quantity, views):
+    def errors_of(quantity, views, fn=bands.band_errors):
         found = [
             fn(quantity, view.image, view.truth[quantity], view.known, depth_factor=factor)
             for view in views
         ]
         return [errors for errors in found if errors is not None]
 
-    calibration = calibrate_renders(
-        {quantity: errors_of(band_errors, quantity, fit) for quantity in QUANTITIES},
-        {quantity: errors_of(band_errors, quantity, calibrating) for quantity in QUANTITIES},
+    calibration = bands.calibrate_renders(
+        *({q: errors_of(q, views) for q in bands.QUANTITIES} for views in (fit, calibrating)),
         scale=scale,
         depth_factor=factor,
     )
     numbers = {}
-    for quantity in QUANTITIES:
-        calibrated, banded = getattr(calibration, quantity), errors_of(band_errors, quantity, test)
+    for quantity in bands.QUANTITIES:
+        calibrated, banded = getattr(calibration, quantity), errors_of(quantity, test)
         if calibrated is None or not banded:
             continue
-        errors, known = map(np.concatenate, zip(*errors_of(render_errors, quantity, test)))
-        has = np.concatenate([has_band(quantity, view.image) for view in test])
+        errors, known = map(np.concatenate, zip(*errors_of(quantity, test, bands.render_errors)))
+        has = np.concatenate([bands.has_band(quantity, view.image) for view in test])
         without = errors[known & ~has]
         numbers[quantity] = to_json(coverage_report(calibrated, banded)) | {
             "share_with_band": float(has[known].mean()),
@@ -390,7 +375,7 @@ def calibrate_samples(
     return calibration, numbers
 
 
-def load_calibration(path: pathlib.Path) -> RenderCalibration:
+def load_calibration(path: pathlib.Path) -> bands.RenderCalibration:
     """Intervals of a file `seed_<n>_calibration.json`; `bands.add_bands` puts them around renders.
 
     Raises:
@@ -399,6 +384,6 @@ def load_calibration(path: pathlib.Path) -> RenderCalibration:
     ways = {"absent": "run experiments.evaluate_uncertainty", "fix": "make it anew"}
     values = read_versioned(path, CALIBRATION_VERSION, error=WorkdirError, **ways)
     try:
-        return calibration_from_json(values.get("calibration") or {})
+        return bands.calibration_from_json(values.get("calibration") or {})
     except ValueError as error:
         raise WorkdirError(f"{path}: {error}") from None

@@ -13,8 +13,6 @@ random ones; and how well each number that a set can be described by ranks all s
 them. Each round that was trained anew is a set of its own.
 """
 
-from __future__ import annotations
-
 import pathlib
 
 import numpy as np
@@ -28,9 +26,8 @@ from experiments import runtime
 from experiments.build import initial_views, load_config_scene
 from experiments.files import leaves, write_json
 from experiments.reporting import stats
-from experiments.reporting.page import Section, write_page
 from experiments.reporting.results import Run, load_runs
-from experiments.reporting.tables import collected_text
+from experiments.reporting.tables import Section, collected_text, write_page
 from experiments.reporting.view_sets import FILE, RANDOM, features_plot, view_set_tables
 from experiments.runtime import ReportError
 from experiments.schema import check_config
@@ -38,16 +35,9 @@ from experiments.trained import renewed_config
 
 # Options that runs must share, or their numbers cannot be compared.
 ALIKE = (
-    "loader",
-    "scene",
-    "image_size",
-    "load.",
-    "pool.",
-    "rays_per_pixel",
-    "field_kind",
-    "sampler_kind",
+    *("loader", "scene", "image_size", "load.", "pool.", "rays_per_pixel", "field_kind"),
+    *("sampler_kind", "hash_grid.", "nerf_mlp.", "mip_mlp.", "march.", "proposal.", "train."),
 )
-ALIKE += ("hash_grid.", "nerf_mlp.", "mip_mlp.", "march.", "proposal.", "train.")
 
 # Policies whose own field differs from all others'.
 OTHER_FIELDS = {name for name, p in POLICIES.items() if p.field_kind != RECONSTRUCTION}
@@ -87,7 +77,13 @@ def find_runs(folders: list[str]) -> list[tuple[Run, ConfigDict]]:
 
 def run_config(run: Run) -> ConfigDict:
     """The config that a run was made with; options that it did not know have their default."""
-    config = renewed_config(run.result["config"])
+    try:
+        config = renewed_config(run.result["config"])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        reason = str(error).split(".")[0]
+        raise ReportError(
+            f"{run.folder}: config cannot be read ({reason}); leave it out"
+        ) from error
     config.data_dir = FLAGS.data_dir or config.data_dir
     return check_config(config)
 
@@ -161,9 +157,8 @@ def main() -> None:
     result = {
         "schema_version": 1,
         "scene": scene.name,
+        **runtime.made_by(),
         "device": runs[0][0].result["device"],
-        "command": runtime.command_line(),
-        "versions": runtime.versions(),
         "numbers": measure_sets(scene, runs),
     }
     write_json(folder / FILE, result)

@@ -30,10 +30,9 @@ WORK = {
     "experiments.remeasure": ("remeasure",),
     "experiments.benchmark": ("benchmark",),
     "experiments.time_to_quality": ("compare_caches", "run_part"),
-    "experiments.export_field": ("script.saved_config", "script.load_config_scene"),
-    "experiments.clean_up": ("script.saved_config", "script.load_config_scene"),
-    "experiments.posterior_draws": ("script.saved_config", "script.load_config_scene"),
-    "experiments.report": ("write_report",),
+    "experiments.export_field": ("posthoc.saved_config", "posthoc.load_config_scene"),
+    "experiments.clean_up": ("posthoc.saved_config", "posthoc.load_config_scene"),
+    "experiments.posterior_draws": ("posthoc.saved_config", "posthoc.load_config_scene"),
 }
 
 

@@ -6,8 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.bench import same_numbers, stages
-from experiments.bench.same_numbers import difference, differences_table, too_large
+from experiments import stages
+from experiments.reporting.result_tables import DEVICE_FILE, collect_all, differences_table
+from experiments.stages import difference, too_large
 from tests.script_server import run_script
 
 
@@ -46,7 +47,7 @@ def test_without_an_accelerator_there_is_nothing_to_compare(tmp_path):
 def test_a_device_that_computes_something_else_is_found_out(monkeypatch):
     """Numbers of one device against its own, first as they are, then with another step size."""
     (device,) = jax.devices("cpu")[:1]
-    same = same_numbers.check_field("hash_grid", device, device)
+    same = stages.check_field("hash_grid", device, device)
     assert set(same.values()) == {0.0} and {"gradient", "curvature", "views, bavs"} <= same.keys()
     original = stages.Problem
     calls = []
@@ -59,13 +60,11 @@ def test_a_device_that_computes_something_else_is_found_out(monkeypatch):
         return original(config, *args)
 
     monkeypatch.setattr(stages, "Problem", other_second_time)
-    other = same_numbers.check_field("hash_grid", device, device)
+    other = stages.check_field("hash_grid", device, device)
     assert other["curvature"] > 0.1 and other["loss"] == 0.0
 
 
 def test_table_of_a_file_names_device_and_precision(tmp_path):
-    from experiments.reporting.result_tables import collect_all
-
     result = {
         "schema_version": 1,
         "command": "made",
@@ -73,7 +72,7 @@ def test_table_of_a_file_names_device_and_precision(tmp_path):
         "matmul_precision": "highest",
     }
     result |= {"differences": {"hash_grid": {"loss": 1e-7}}}
-    (tmp_path / same_numbers.DEVICE_FILE).write_text(json.dumps(result))
+    (tmp_path / DEVICE_FILE).write_text(json.dumps(result))
     (found,) = collect_all(tmp_path)
     assert "a card" in found.made and "highest" in found.made
     assert found.tables["differences"].rows[0][1].text == "1.0e-07"

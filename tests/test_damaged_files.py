@@ -229,10 +229,10 @@ def test_a_full_disk_is_one_line_that_names_the_file(tmp_path, full_disk):
 
 
 def test_a_script_on_a_full_disk_says_so_in_one_line(copy):
-    command = f"ulimit -f 2; exec {sys.executable} -m experiments.report --workdir={copy}"
+    command = f"ulimit -f 2; exec {sys.executable} -m experiments.figures --workdir={copy}"
     done = subprocess.run(["sh", "-c", command], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 1
-    one_line(done.stderr, "error: ", copy / "report.html", "cannot be written")
+    one_line(done.stderr, "error: ", copy / "figures" / "psnr.png", "cannot be written")
 
 
 @pytest.mark.parametrize("name", ["file/cache", "dev/null"])

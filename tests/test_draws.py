@@ -19,7 +19,7 @@ from bavs_jax.uncertainty.draws import (
     noise_scale,
 )
 from bavs_jax.uncertainty.posterior import default_prior_weight, posterior_precision
-from experiments.posthoc.draws import farthest_view, spread_measures
+from experiments.posthoc import farthest_view, spread_measures
 from tests.toy_fields import (
     NOTHING_LEARNT,
     even_sampler,

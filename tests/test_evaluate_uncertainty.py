@@ -139,9 +139,9 @@ def test_script_writes_numbers_curves_and_a_page(finished):
     assert second["own"] != second["common"]
     assert first["psnr"] == first["psnr_common"] == second["psnr_common"] != second["psnr"]
     page = (base / "uncertainty.html").read_text()
-    # Curves, coverage and tenths of both quantities, and one test view.
-    assert page.count("<svg ") == 2 + 4 + 1 and "learned_variance" in page
-    assert all(name in page for name in first["own"]) and "remaining" in out
+    # Curves, coverage of both quantities, and one test view.
+    assert page.count("<svg ") == 2 + 2 + 1 and "learned_variance" in page
+    assert "remaining" in out
 
 
 def test_intervals_are_of_views_that_nothing_was_trained_on(finished):

@@ -138,7 +138,7 @@ def test_flags_of_every_script_are_taken_or_refused_in_one_line(name, tmp_path):
     own = sorted(server.flags.keys() - {"config", "sizes"})
     options = [f"config.{option}" for option in SCHEMA] if "config" in server.flags else []
     options += ["config", "config.", "config.nothing"] if options else []
-    options += ["sizes.repeats", "sizes.growth.grid_log2"] if "sizes" in server.flags else []
+    options += ["sizes.repeats", "sizes.matmul"] if "sizes" in server.flags else []
     names = (
         st.one_of(st.sampled_from(own), st.sampled_from(options))
         if options

@@ -327,14 +327,6 @@ def test_maps_of_captures_that_are_no_orbit(capture):
     assert "nan" not in svg
 
 
-def test_colourise_ends_of_the_scale_and_unknown_values():
-    values = np.array([[0.0, 0.5, 2.0, np.nan]])
-    black, middle, top, unknown = pictures.colourise(values, 0.0, 1.0, "magma")[0]
-    assert tuple(black) == (0, 0, 4)  # magma's first colour
-    assert top.sum() > middle.sum() > black.sum()
-    np.testing.assert_array_equal(unknown, 153)
-
-
 def test_shrink_averages_areas_of_colours_and_of_values():
     image = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(2, 4, 3) * 4
     blocks = image.reshape(2, 2, 2, 3).mean(axis=(0, 2))

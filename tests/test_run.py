@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bavs_jax.selection.policies import POLICIES
-from experiments.posthoc.lpips import remeasure
+from experiments.posthoc import remeasure
 from experiments.reporting.result_tables import collect_tables
 from experiments.runtime import ConfigError, WorkdirError
 from tests.script_server import ROOT, run_script

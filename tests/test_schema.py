@@ -13,15 +13,15 @@ import pytest
 from ml_collections import ConfigDict
 
 from experiments import configs
-from experiments.bench.stages import check_sizes, default_sizes
 from experiments.build import check_views
 from experiments.configs import base, quickstart
 from experiments.configs.paper import protocols
 from experiments.files import OLD_VALUES
 from experiments.runtime import ConfigError
 from experiments.schema import FLAG, SCHEMA, check_config, leaves
+from experiments.stages import check_sizes, default_sizes
 from experiments.suggestion import default_config
-from experiments.sweeps.plan import MAX_TRIALS, parse_axes
+from experiments.sweep_plan import MAX_TRIALS, parse_axes
 from experiments.trained import saved_config
 from tests.toy_runs import OVERRIDES, toy_config
 from tests.toy_scenes import toy_scene

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from experiments.sweeps.jobs import death_words
+from experiments.jobs import death_words
 from tests.scene_files import write_nerfstudio
 from tests.toy_runs import toy_flags
 
@@ -28,14 +28,13 @@ READS = {
     "figures": (None, "summary.json"),
     "posterior_draws": (None, "config.json"),
     "remeasure": (None, "config.json"),
-    "report": (None, "summary.json"),
     "suggest_views": ("--data={}/data", "config.json"),
     "sweep": ("--config={}/c.py", "c.py"),
     "tables": (None, "summary.json"),
     "time_to_quality": ("--config={}/c.py", "c.py"),
     "view_sets": ("--runs={}", "summary.json"),
 }
-QUICK = ("active_selection", "report")
+QUICK = ("active_selection", "tables")
 
 
 def start(module, *flags, **env):

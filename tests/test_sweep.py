@@ -13,7 +13,7 @@ import pytest
 from experiments.configs import quickstart
 from experiments.files import exclusive, write_arrays, write_json
 from experiments.runtime import ConfigError, WorkdirError
-from experiments.sweeps.plan import (
+from experiments.sweep_plan import (
     Record,
     make_settings,
     make_trials,

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from experiments.sweeps.jobs import Job, LocalEngine, make_slots, open_process, run_jobs
+from experiments.jobs import Job, LocalEngine, make_slots, open_process, run_jobs
 
 ROOT = pathlib.Path(__file__).parents[1]
 
@@ -108,10 +108,10 @@ def test_a_closed_iterator_leaves_no_process(tmp_path):
 
 def test_a_process_ends_with_the_program_that_started_it(tmp_path):
     """The starter is killed with SIGKILL, so that it can do nothing about it."""
-    child = "from experiments.runtime import end_with_parent as e; e(); "
+    child = "from experiments.active_selection import end_with_parent as e; e(); "
     child += "import os, time; print('pid', os.getpid(), flush=True); time.sleep(100)"
     starter = (
-        "import pathlib, sys, time; from experiments.sweeps.jobs import open_process; "
+        "import pathlib, sys, time; from experiments.jobs import open_process; "
         f"p = open_process(['-c', {child!r}], pathlib.Path(sys.argv[1])); time.sleep(100)"
     )
     log = tmp_path / "log.txt"

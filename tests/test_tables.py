@@ -28,7 +28,7 @@ from experiments.reporting.tables import (
     markdown,
 )
 from experiments.runtime import ReportError
-from experiments.sweeps.plan import Record, write_record
+from experiments.sweep_plan import Record, write_record
 from experiments.tables import MARKED, fill_page, result_tables
 from tests.report_files import make_result, write_workdir
 

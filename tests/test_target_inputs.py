@@ -19,8 +19,7 @@ from bavs_jax.target_inputs import evenly_spaced_cameras
 from bavs_jax.uncertainty.model import Acquired
 from bavs_jax.uncertainty.posterior import NOISE_VARIANCE, offset_variance
 from bavs_jax.uncertainty.streaming import rays_through_pixels
-from experiments.build import Problem
-from experiments.build_targets import build_targets
+from experiments.build import Problem, build_targets
 from tests.toy_rounds import silent
 from tests.toy_runs import toy_config
 from tests.toy_scenes import toy_scene

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from experiments.bench.results import QUALITY, first_seconds, plateau, quality_tables
+from experiments.reporting.benchmark import QUALITY, first_seconds, plateau, quality_tables
 from experiments.reporting.tables import collected_text
 from tests.script_server import run_script
 from tests.toy_runs import toy_flags

@@ -9,11 +9,9 @@ from experiments.reporting.uncertainty import (
     CONSTANT,
     RESULT_VERSION,
     coverage_table,
-    known_variants,
     load_result,
     save_result,
     summary_table,
-    variants_table,
 )
 from experiments.runtime import ReportError
 from experiments.tables import result_tables
@@ -86,17 +84,6 @@ def make_result():
 def cells_of(table):
     """By the first cells of a row, the texts by the names of the columns."""
     return {row[0].text: dict(zip(table.head, (cell.text for cell in row))) for row in table.rows}
-
-
-def test_every_variant_has_a_row_for_each_field_and_normalisation():
-    rows = make_rows()
-    assert "depth_mae_pooled" in known_variants(rows) and len(known_variants(rows)) == 4
-    cells = cells_of(variants_table(rows))
-    assert len(cells) == 4 * 2 * 2
-    common = cells["depth_mae_pooled, common field"]
-    # Half of the interval of two seeds: 12.706 / sqrt(2) * sqrt(0.5) * 0.01.
-    assert common["laplace"] == "0.205 ± 0.064" and common["cf_nerf"] == "0.300"
-    assert cells["depth_mae_pooled, own field, unnormalised"]["laplace"] == "0.0200 ± 0.0000"
 
 
 def test_summary_has_a_row_for_each_model_and_field():

@@ -1,7 +1,5 @@
 """Maps of the cameras seen from above the scene: candidates, scores and choices of each round."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -66,9 +64,7 @@ def stand_within(offsets: np.ndarray) -> bool:
 def map_plot(acquisition: dict[str, np.ndarray], *, salt: str) -> Markup:
     """One small map per round, on one scale of colours; without a round, of the initial views.
 
-    Args:
-      acquisition: arrays of `acquisition.npz`.
-      salt: makes the ids of the SVG unique on the page.
+    `acquisition` are the arrays of `acquisition.npz`; `salt` makes ids unique on the page.
     """
     offsets = acquisition["positions"].astype(float) - acquisition["centre"]
     # A camera in the very centre has no direction; it is drawn at the pole.

@@ -1,15 +1,10 @@
 """Pictures of test views: images of a page, panels of a figure, and the figures as files."""
 
-from __future__ import annotations
-
-import base64
-import io
 import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -28,30 +23,6 @@ PANEL = 2.1  # inches
 
 
 # --- pictures of a page ---
-
-
-class Picture(NamedTuple):
-    """One image of a page."""
-
-    uri: str
-    caption: str
-    low: str = ""
-    high: str = ""
-
-
-def png_uri(image: np.ndarray) -> str:
-    """[H, W, 3] uint8 as a `data:` address that stands in the page itself."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="png", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-
-
-def colourise(values: np.ndarray, low: float, high: float, name: str) -> np.ndarray:
-    """[H, W] values as [H, W, 3] uint8 colours; grey where a value is not finite."""
-    scaled = (values - low) / max(high - low, 1e-12)
-    rgb = colormaps[name](np.clip(np.nan_to_num(scaled, nan=0.0), 0.0, 1.0))[..., :3]
-    rgb[~np.isfinite(values)] = 0.6
-    return np.round(255.0 * rgb).astype(np.uint8)
 
 
 def shrink(image: np.ndarray, max_side: int) -> np.ndarray:
@@ -140,14 +111,9 @@ def views_figure(
 ) -> Figure:
     """A row for each test view: the truth, then each policy's render and rendered uncertainty.
 
-    Args:
-      pictures: of each policy, what its run left in `pictures.npz`.
-      num_views: most rows, of the views that all of them show.
-      limits: of the colours of uncertainty; None: those of these pictures.
-      errors: whether the error of a render stands between it and its uncertainty.
-
-    Raises:
-      ReportError: there is no such view.
+    Of each policy `pictures` are what its run left in `pictures.npz`; at most `num_views` that all
+    of them show are shown, ReportError of none. `limits` are of the colours of uncertainty, by
+    default those of these pictures; with `errors` that of each render is beside it.
     """
     places = {p: {int(v): i for i, v in enumerate(a["view_ids"])} for p, a in pictures.items()}
     first, *others = places.values()
@@ -188,14 +154,8 @@ def write_figures(
 ) -> list[pathlib.Path]:
     """Writes every figure that the results of a folder have numbers for, and says where.
 
-    Args:
-      workdir: with `summary.json` and the arrays of each run.
-      form: one of `FORMATS`.
-      policies: which, in this order; none: all.
-      num_views: most test views.
-
-    Raises:
-      ReportError: a file that cannot be used, or a policy without a run.
+    Of some `policies` in this order, or of all, and at most `num_views` test views; `form` is one
+    of `FORMATS`.
     """
     runs = load_runs(workdir, policies)
     shown = policies_of(runs)

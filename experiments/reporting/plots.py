@@ -1,7 +1,5 @@
 """Curves of runs; how every figure looks, and how it becomes an element of a page."""
 
-from __future__ import annotations
-
 import io
 import os
 import pathlib
@@ -12,7 +10,6 @@ import matplotlib
 import numpy as np
 from markupsafe import Markup
 from matplotlib import style as matplotlib_style
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -38,10 +35,7 @@ DOT = {"markeredgecolor": "white"}
 def to_svg(figure: Figure, *, salt: str, label: str) -> Markup:
     """A figure as an `<svg>` element that may stand in a page beside others, as it is.
 
-    Args:
-      figure: what to draw.
-      salt: makes the ids of this element differ from those of the other ones.
-      label: what it shows, for readers who do not see it.
+    The `salt` makes its ids differ from those of others; the `label` is for readers who do not see.
     """
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": salt}):
@@ -60,13 +54,6 @@ def save_figure(figure: Figure, path: str | os.PathLike) -> None:
     """Writes a figure whole or not at all; the end of its name, such as `.pdf`, is the format."""
     form = pathlib.Path(path).suffix.removeprefix(".")
     write_atomic(path, lambda file: figure.savefig(file, format=form))
-
-
-def tidy(axes: Axes, grid: str | None = None) -> None:
-    """Takes the frame away but for the axes, and draws lines across one of them, "x" or "y"."""
-    axes.spines[["top", "right"]].set_visible(False)
-    if grid is not None:
-        axes.grid(axis=grid)
 
 
 def policy_style(policies: list[str]) -> dict[str, tuple[str, str]]:
@@ -115,6 +102,6 @@ def quality_figure(runs: list[Run], policies: list[str], measure: Measure) -> Fi
     axes.set_xlabel(label, fontsize=9)
     axes.set_title(f"{measure.heading}, {measure.better} is better")
     axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
-    tidy(axes, "y")
+    axes.grid(axis="y")
     axes.legend()
     return figure

@@ -1,7 +1,5 @@
 """The report of a run: what came out in plain words, then all numbers, pictures and choices."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -9,9 +7,8 @@ from pathlib import Path
 from bavs_jax.pools import BANDS, crowded_band
 from experiments.reporting import pictures, plots, results, run_tables, stats
 from experiments.reporting.camera_map import map_plot
-from experiments.reporting.page import FOLDER, write_template
 from experiments.reporting.stats import MEASURES, REFERENCES
-from experiments.reporting.tables import interval_cell
+from experiments.reporting.tables import interval_cell, write_template
 
 SEED_SPREAD = (
     "One seed proves little: seeds often differ by half a dB, as much as most gains; run 5 or more."
@@ -19,17 +16,10 @@ SEED_SPREAD = (
 
 
 def write_report(workdir: str | os.PathLike) -> Path:
-    """Writes `report.html` from the result files of a working folder, and from nothing else.
+    """Writes `report.html` from the result files of a working folder, and says where.
 
-    Args:
-      workdir: folder with `summary.json` and, as far as they exist, the `pictures.npz` and
-        `acquisition.npz` of each run.
-
-    Returns:
-      Path of the page.
-
-    Raises:
-      ReportError: a file is missing, broken or of another schema version.
+    Pictures and maps are of the runs that have `pictures.npz` and `acquisition.npz`. Raises
+    ReportError for a file that cannot be used.
     """
     runs = results.load_runs(Path(workdir))
     policies = plots.by_interest(results.policies_of(runs))
@@ -48,7 +38,7 @@ def write_report(workdir: str | os.PathLike) -> Path:
     path = Path(workdir) / "report.html"
     write_template(
         path,
-        FOLDER / "report.html",
+        "report.html",
         runs=runs,
         pool=next((pool_words(run.result.get("config", {}).get("pool", {})) for run in runs), ""),
         policies=policies,

@@ -1,22 +1,19 @@
 """All that the result files of a folder say, whichever script wrote them, as named tables."""
 
-from __future__ import annotations
-
 import pathlib
 from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 
-from experiments.bench import results as bench
-from experiments.bench.same_numbers import DEVICE_FILE, differences_table
-from experiments.reporting import run_tables, stats, uncertainty, view_sets
+from experiments.reporting import benchmark, run_tables, stats, uncertainty, view_sets
 from experiments.reporting.results import Run, load_runs, policies_of, read_result
-from experiments.reporting.tables import Collected, Table, interval_cell
+from experiments.reporting.tables import Cell, Collected, Table, dash, interval_cell
 from experiments.runtime import ReportError
-from experiments.sweeps.plan import FILE as SWEEP_FILE
-from experiments.sweeps.plan import Record, read_record
+from experiments.sweep_plan import FILE as SWEEP_FILE
+from experiments.sweep_plan import Record, read_record
 
+DEVICE_FILE = "check_device.json"
 INTERVALS = "means over seeds ± half of the 95 % interval"
 
 
@@ -40,16 +37,8 @@ def collect_tables(
 
     Of an experiment: quality at the last shared number of views, round by round, and where the
     time went. Of a sweep: its settings against each other; of one over scenes also their mean.
-
-    Args:
-      folder: with `summary.json`, or of a sweep.
-      paper: a table of the paper whose rows are put beside ours, or beside means over scenes; see
-        `run_tables.PAPER`.
-      only: policies to show, in this order; by default all.
-
-    Raises:
-      ReportError: a file that cannot be used; no result so far; one of `only` without a run; or
-        `paper` where settings are no scenes.
+    Rows of `paper`, a table of `run_tables.PAPER`, are put beside ours; `only` names policies to
+    show, in this order. Raises ReportError for a file of no use, or where there is no result.
     """
     record = read_record(folder)
     if record is not None and any(row["values"] for row in record.settings):
@@ -143,6 +132,17 @@ def _device(path: pathlib.Path) -> Collected:
     return Collected(f"`{result['command']}` ({how})", tables)
 
 
+def differences_table(differences: dict[str, dict[str, float]]) -> Table:
+    """A row for each field, a column for each thing that was compared."""
+    names = list(dict.fromkeys(what for row in differences.values() for what in row))
+    rows = []
+    for name, row in differences.items():
+        missing = dash(f"not compared for {name}")
+        cells = [Cell(f"{row[what]:.1e}") if what in row else missing for what in names]
+        rows.append((Cell(name), *cells))
+    return Table(("field", *names), tuple(rows))
+
+
 def _trained(make_table: Callable[[list[dict]], Table], path: pathlib.Path) -> Collected:
     """What a script on a trained run has measured, over its seeds."""
     result = read_result(path)
@@ -214,8 +214,7 @@ def _line(name: str, by_seed, digits: int, *, gap: bool = False) -> list:
 FILES: dict[str, Callable[[pathlib.Path], Collected]] = {
     uncertainty.NAME: _uncertainty,
     DEVICE_FILE: _device,
-    bench.BENCHMARK: bench.benchmark_tables,
-    bench.QUALITY: bench.quality_tables,
+    **benchmark.FILES,
     "cleanup.json": partial(_trained, cleanup_table),
     "draws.json": partial(_trained, draws_table),
     "geometry.json": partial(_trained, geometry_table),

@@ -1,7 +1,5 @@
 """Result files, read and checked: the runs of a folder, their pictures, and what they chose."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
@@ -44,11 +42,7 @@ class Run:
 
 
 def read_result(path: Path, version: int = SCHEMA_VERSION, made_by: str = "experiment") -> dict:
-    """The content of a script's result file.
-
-    Raises:
-      ReportError: the file is missing, broken or of another version.
-    """
+    """The content of a script's result file; ReportError if it cannot be used."""
     absent, fix = f"give the --workdir of an {made_by}", f"run the {made_by} again"
     return read_versioned(path, version, error=ReportError, absent=absent, fix=fix)
 
@@ -56,9 +50,7 @@ def read_result(path: Path, version: int = SCHEMA_VERSION, made_by: str = "exper
 def load_runs(workdir: Path, policies: Sequence[str] = ()) -> list[Run]:
     """The runs of `summary.json`, policy by policy: of all, or of some in the order given.
 
-    Raises:
-      ReportError: the file is missing or broken, or holds runs of more than one scene; or a policy
-        has no run.
+    Raises ReportError for a file of no use or of several scenes, or a policy without a run.
     """
     path, runs = workdir / "summary.json", []
     for result in read_result(path)["runs"]:

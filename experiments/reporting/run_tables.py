@@ -1,7 +1,5 @@
 """Tables of runs: quality, rounds, baselines, time, choices, settings of a sweep, the paper's."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

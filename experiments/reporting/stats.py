@@ -1,7 +1,5 @@
 """Means and intervals over seeds, and gaps between policies, of one scene or of several."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 

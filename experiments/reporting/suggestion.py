@@ -1,7 +1,5 @@
 """A suggestion as files: the chosen poses in several formats, numbers, and a page with reasons."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
@@ -27,7 +25,6 @@ from experiments.evaluate import render_with_bar
 from experiments.files import read_json, write_atomic, write_json
 from experiments.reporting import plots
 from experiments.reporting.camera_map import SCORE_MAP
-from experiments.reporting.page import Section, write_page
 from experiments.reporting.pictures import (
     Panel,
     colour_bar,
@@ -35,8 +32,8 @@ from experiments.reporting.pictures import (
     shrink,
     uncertainty_limits,
 )
-from experiments.reporting.tables import Cell, Table, dash
-from experiments.runtime import command_line, device_name, peak_memory_mb, versions, warn
+from experiments.reporting.tables import Cell, Section, Table, dash, write_page
+from experiments.runtime import made_by, peak_memory_mb, warn
 from experiments.suggestion import Options, Suggestion, in_matter
 from experiments.trained import TrainedRun
 
@@ -97,10 +94,11 @@ def write_results(
     is_high = [image["uncertainty"] > high for image in images]
     poses = np.asarray(cameras.world_from_cam, np.float64)
     facts = [pose_facts(scene, *pair, density_fn) for pair in zip(poses, is_high)]
+    made = made_by()
+    versions = made.pop("versions")  # of the page alone
     summary = {
         "scene": scene.name,
-        "command": command_line(),
-        "device": device_name(),
+        **made,
         "seconds": time.monotonic() - begin,
         "peak_memory_mb": peak_memory_mb(),
         "drawn": found.proposals.num_drawn,
@@ -130,17 +128,13 @@ def write_results(
             note=Markup("<br>").join(place_notes(run, found, options, facts)),
             plots=place_plots(scene, found, chosen, start if options.route else None),
         ),
-        Section(
-            "When to stop",
-            note=summary["worth"],
-            plots=[worth_plot(worth, found.photo_gain)],
-        ),
+        Section("When to stop", note=summary["worth"], plots=[worth_plot(worth, found.photo_gain)]),
     ]
     if options.route:
         length = route_length(start, places, order)
         print(f"route: {length:.3g} units from ({', '.join(f'{x:.3g}' for x in start)})")
     files["report"] = folder / "report.html"
-    title, made = f"Where to stand next: {scene.name}", summary | {"versions": versions()}
+    title, made = f"Where to stand next: {scene.name}", summary | {"versions": versions}
     write_page(files["report"], title=title, made=made, sections=sections)
     write_json(folder / "suggestion.json", summary)
     return files
@@ -170,9 +164,10 @@ def write_poses(
     write_camera_path(files["camera path"], frames, lens)
     # nerfstudio renders a camera path in the coordinates of its own normalisation, which are the
     # scene's: levelled, centred and scaled as by its defaults.
-    normalised = []
-    for frame, pose in zip(frames, np.asarray(cameras.world_from_cam, float)):
-        normalised.append(frame | {"transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]]})
+    poses = np.asarray(cameras.world_from_cam, float).tolist()
+    bottom = [0.0, 0.0, 0.0, 1.0]
+    pairs = zip(frames, poses)
+    normalised = [frame | {"transform_matrix": [*pose, bottom]} for frame, pose in pairs]
     write_camera_path(folder / "camera_path_normalised.json", normalised, lens)
     write_csv(files["table"], frames)
     return files
@@ -371,7 +366,6 @@ def place_plots(scene: Scene, found: Suggestion, chosen, start) -> list[Markup]:
             panel.scatter(*stops[:, :1], marker="s", s=40, color=plots.BLACK, zorder=5)
         panel.set(title=title, xlabel="to the right (user units)", ylabel=upwards)
         panel.set_aspect("equal", adjustable="datalim")
-        plots.tidy(panel)
         colour_bar(figure, [panel], SCORE_MAP, (norm.vmin, norm.vmax), "score: mean uncertainty")
         figure.legend(loc="outside lower left", ncols=3)
         label = f"Photos, candidates and chosen poses: {title}"
@@ -395,6 +389,5 @@ def worth_plot(worth: Worth, photo_gain: float) -> Markup:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.set_ylim(0.0, None)
-    plots.tidy(axes)
     axes.legend(loc="lower left")
     return plots.to_svg(figure, salt="worth", label="Worth of the best candidate left")

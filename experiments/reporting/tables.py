@@ -1,12 +1,17 @@
-"""A table: cells that may say why they are empty, as Markdown, CSV or LaTeX; HTML: table.html."""
-
-from __future__ import annotations
+"""Tables, whose cells may say why they are empty, as Markdown, CSV or LaTeX; and pages of them."""
 
 import csv
 import dataclasses
 import io
+import os
+import pathlib
 from collections.abc import Sequence
+from typing import NamedTuple
 
+import jinja2
+from markupsafe import Markup
+
+from experiments.files import write_atomic
 from experiments.reporting.stats import Interval, paired_p_value
 
 
@@ -161,3 +166,35 @@ def collected_text(
         blocks.append(title + FORMATS[form](found.tables[name]))
     blocks += [sign + note for note in found.notes]
     return "\n\n".join(blocks) + "\n"
+
+
+# --- pages: one template, filled and written whole; they need no other file and no network -----
+
+FOLDER = pathlib.Path(__file__).parent  # of the templates that pages share
+
+
+class Section(NamedTuple):
+    """One part of a page, shown in this order."""
+
+    title: str
+    table: Table | None = None
+    note: str = ""
+    plots: Sequence[Markup] = ()  # from `plots.to_svg`
+
+
+def write_page(path: str | os.PathLike, *, title: str, made: dict, sections: list[Section]) -> None:
+    """Writes a page of sections about a result file, whose making it shows too."""
+    write_template(path, "sections.html", title=title, made=made, sections=sections)
+
+
+def write_template(path: str | os.PathLike, name: str, **content) -> None:
+    """Writes a template, filled with all that it names; texts are escaped, `Markup` is not."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(FOLDER),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    text = environment.get_template(name).render(**content)
+    write_atomic(path, lambda file: file.write(text.encode()))

@@ -1,7 +1,6 @@
 """`uncertainty.json`, its tables and its page: how well uncertainty tells error."""
 
-from __future__ import annotations
-
+import itertools
 import json
 import pathlib
 
@@ -13,8 +12,7 @@ from matplotlib.ticker import PercentFormatter
 
 from bavs_jax.metrics.ause import removal_fractions, variant_name
 from experiments.files import cut_pictures, write_atomic
-from experiments.reporting import page, plots, stats
-from experiments.reporting.page import Section
+from experiments.reporting import plots, stats, tables
 from experiments.reporting.pictures import (
     ERROR_LIMIT,
     ERROR_MAP,
@@ -23,7 +21,7 @@ from experiments.reporting.pictures import (
     panel_table,
 )
 from experiments.reporting.results import read_result
-from experiments.reporting.tables import Cell, Table, dash, interval_cell
+from experiments.reporting.tables import Cell, Section, Table, dash, interval_cell
 from experiments.runtime import ReportError
 
 RESULT_VERSION = 2
@@ -107,34 +105,18 @@ def summary_table(rows: list[dict]) -> Table:
     head = ["model", "measured on", "seeds", "PSNR of the field (dB)"]
     for of in ("depth", "colour"):
         head += [f"AUSE {of} MAE", f"{of}: minus {first}", f"AUSE {of} MAE, unnorm."]
+    fields = {"own": ("its own field", "psnr"), "common": ("common field", "psnr_common")}
     table = []
-    for field, words, psnr in (
-        ("own", "its own field", "psnr"),
-        ("common", "common field", "psnr_common"),
-    ):
-        for model in models:
-            psnrs = [row[psnr] for row in rows if row["model"] == model]
-            cells = [Cell(model), Cell(words), Cell(str(len(psnrs)))]
-            cells.append(interval_cell(stats.mean_interval(psnrs), 2, ""))
-            for of in ("depth", "colour"):
-                variant = variant_name(of=of, error="mae", pooled=False)
-                cells.append(_ause_cell(rows, model, field, variant))
-                cells.append(_gap_cell(rows, model, first, field, variant))
-                cells.append(_ause_cell(rows, model, field, variant, "unnormalised"))
-            table.append(tuple(cells))
-    return Table(tuple(head), tuple(table))
-
-
-def variants_table(rows: list[dict]) -> Table:
-    """Every variant of AUSE of each model, on its own field and on the common one."""
-    models, table = models_of(rows), []
-    for variant in known_variants(rows):
-        for field in FIELDS:
-            for key in ("ause", "unnormalised"):
-                name = f"{variant}, {field} field{', unnormalised' * (key != 'ause')}"
-                cells = [_ause_cell(rows, model, field, variant, key) for model in models]
-                table.append((Cell(name), *cells))
-    return Table(("AUSE", *models), tuple(table))
+    for (field, (words, psnr)), model in itertools.product(fields.items(), models):
+        psnrs = [row[psnr] for row in rows if row["model"] == model]
+        cells = [model, words, len(psnrs), interval_cell(stats.mean_interval(psnrs), 2, "")]
+        for of in ("depth", "colour"):
+            variant = variant_name(of=of, error="mae", pooled=False)
+            cells.append(_ause_cell(rows, model, field, variant))
+            cells.append(_gap_cell(rows, model, first, field, variant))
+            cells.append(_ause_cell(rows, model, field, variant, "unnormalised"))
+        table.append(cells)
+    return Table(head, table)
 
 
 def coverage_table(rows: list[dict], quantity: str) -> Table:
@@ -142,11 +124,8 @@ def coverage_table(rows: list[dict], quantity: str) -> Table:
     levels = rows[0]["intervals"][quantity]["levels"]
     names = ", ".join(f"{level:.0%}" for level in levels)
     head = [f"intervals of {quantity}", *(f"covered at {level:.0%} (%)" for level in levels)]
-    head += [
-        f"mean half-width at {levels[-2]:.0%} ({QUANTITIES[quantity]})",
-        f"width / constant's at {names}",
-        f"interval score / constant's at {names}",
-    ]
+    head.append(f"mean half-width at {levels[-2]:.0%} ({QUANTITIES[quantity]})")
+    head += [f"{what} / constant's at {names}" for what in ("width", "interval score")]
     table, keys = [], ("coverage", "coverage_stderr", "mean_width", "width_ratio", "score_ratio")
     for model in models_of(rows):
         means = (interval_mean(rows, model, quantity, key) for key in keys)
@@ -156,19 +135,18 @@ def coverage_table(rows: list[dict], quantity: str) -> Table:
         interval_mean(rows, first, quantity, f"constant_{key}") for key in ("coverage", "width")
     )
     table.append(_coverage_row(CONSTANT, shares, np.nan * ones, widths, ones, ones))
-    return Table(tuple(head), tuple(table))
+    return Table(head, table)
 
 
-def _coverage_row(name: str, shares, errors, widths, *ratios) -> tuple[Cell, ...]:
-    cells = [Cell(name)]
+def _coverage_row(name: str, shares, errors, widths, *ratios) -> list:
+    cells = [name]
     for share, error in zip(shares, errors):  # per cent, with the standard error over test views
-        more = "" if np.isnan(error) else f" ± {100.0 * error:.1f}"
-        cells.append(Cell(f"{100.0 * share:.1f}{more}"))
+        cells.append(f"{100.0 * share:.1f}" + ("" if np.isnan(error) else f" ± {100 * error:.1f}"))
     for values, digits in ((0.5 * widths[-2:-1], 4), *((ratio, 2) for ratio in ratios)):
         texts = [f"{value:.{digits}f}" if np.isfinite(value) else "—" for value in values]
         why = None if np.isfinite(values).all() else "too few calibration views for this level"
         cells.append(Cell(" / ".join(texts), why))
-    return tuple(cells)
+    return cells
 
 
 def _values(rows: list[dict], model: str, field: str, variant: str, key: str = "ause") -> dict:
@@ -214,7 +192,6 @@ def write_page(path: pathlib.Path, result: dict, *, arrays: dict, variant: str) 
             f"seeds ± half of the 95 % interval. Curves: {variant}, as a share of the largest.",
             [curve_plot(arrays, field, variant) for field in FIELDS],
         ),
-        Section("Every variant of AUSE", variants_table(rows)),
         *(_interval_section(result, quantity) for quantity in known_quantities(rows)),
         Section(
             "Some test views",
@@ -224,7 +201,7 @@ def write_page(path: pathlib.Path, result: dict, *, arrays: dict, variant: str) 
         ),
     ]
     title = f"Uncertainty against error: {result['scene']}"
-    page.write_page(path, title=title, made=result, sections=sections)
+    tables.write_page(path, title=title, made=result, sections=sections)
 
 
 def _interval_section(result: dict, quantity: str) -> Section:
@@ -234,14 +211,14 @@ def _interval_section(result: dict, quantity: str) -> Section:
         f"{split_words(result)}. Pixels: {result['pixel_rule']}. ±: standard error over test "
         "views. Widths and scores relative to one constant width beat it below 1."
     )
-    charts = [coverage_plot(rows, quantity), decile_plot(rows, quantity)]
-    return Section(f"Intervals of {quantity}", coverage_table(rows, quantity), note, charts)
+    chart = coverage_plot(rows, quantity)
+    return Section(f"Intervals of {quantity}", coverage_table(rows, quantity), note, [chart])
 
 
 def _axes() -> tuple[Figure, Axes]:
     figure = Figure(figsize=(5.6, 4.0))
     axes = figure.add_subplot()
-    plots.tidy(axes, "y")
+    axes.grid(axis="y")
     return figure, axes
 
 
@@ -291,30 +268,6 @@ def coverage_plot(rows: list[dict], quantity: str) -> Markup:
     axes.set_xticks(range(len(levels)), [f"{level:.0%}" for level in levels])
     axes.legend()
     return plots.to_svg(figure, salt=f"coverage-{quantity}", label=f"Coverage of {quantity}")
-
-
-def decile_plot(rows: list[dict], quantity: str) -> Markup:
-    """Coverage at `LEVEL` in each tenth of the pixels, from the least uncertain up."""
-    levels = np.array(rows[0]["intervals"][quantity]["levels"])
-    at, tenths = int(np.argmin(np.abs(levels - LEVEL))), np.arange(1, 11)
-    figure, axes = _axes()
-    axes.axhline(100.0 * LEVEL, color=plots.BLACK, linewidth=1.2, linestyle="--")
-    first, *_ = models = models_of(rows)
-    constant = interval_mean(rows, first, quantity, "constant_decile_coverage")[at]
-    look = {"color": plots.GREY, "linestyle": ":", "linewidth": 2.0}
-    axes.plot(tenths, 100.0 * constant, label=f"constant width, by {first}", **look)
-    for model, (colour, marker) in plots.policy_style(models).items():
-        shares = interval_mean(rows, model, quantity, "decile_coverage")[at]
-        look = {"color": colour, "marker": marker, "markersize": 5, "linewidth": 1.6}
-        axes.plot(tenths, 100.0 * shares, label=model, **look, **plots.DOT)
-    axes.set(
-        title=f"Coverage at {LEVEL:.0%} (%)", xlabel="tenth of the pixels, least uncertain first"
-    )
-    axes.set_xticks(tenths)
-    axes.legend()
-    return plots.to_svg(
-        figure, salt=f"deciles-{quantity}", label=f"Coverage of {quantity} by tenths"
-    )
 
 
 # --- pictures ---

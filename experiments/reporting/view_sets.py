@@ -1,7 +1,5 @@
 """Random sets of views as tables and as a plot: how much is there to win, and by what."""
 
-from __future__ import annotations
-
 import pathlib
 
 import numpy as np
@@ -112,6 +110,5 @@ def features_plot(result: dict) -> Markup | None:
                 axes.scatter(*zip(*points), s=16, **look)
             axes.set_xlabel(name.replace("_", " "))
             axes.set_title(f"PSNR (dB), {group['num_views']} views")
-            plots.tidy(axes)
         line[-1].legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return plots.to_svg(figure, salt="sets", label="PSNR against what sets are described by")

@@ -8,8 +8,6 @@ file are the same by their own names: `table_1.py`, `table_1.py:paper`. Tables 2
 want the scene's name: `--config.scene=...`.
 """
 
-from __future__ import annotations
-
 from ml_collections import ConfigDict
 
 from experiments.configs import base, blender, capture, rivals

@@ -1,7 +1,5 @@
 """What a sweep is made of: axes, a folder for each setting, a job for each part, `sweep.json`."""
 
-from __future__ import annotations
-
 import ast
 import copy
 import dataclasses
@@ -16,8 +14,8 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from experiments.files import Part, all_parts, is_finished, leaves, read_versioned, write_json
+from experiments.jobs import Job
 from experiments.runtime import ConfigError, WorkdirError, shown
-from experiments.sweeps.jobs import Job
 
 MAX_TRIALS = 10_000  # policies x seeds x settings of a sweep
 MAX_TEXT = 100_000  # characters of an axis

@@ -1,19 +1,18 @@
-"""The stages of a run on a trained field: how fast each is, and how its time grows."""
+"""The stages of a run on a trained field: how fast each is, and what two devices make of them."""
 
-from __future__ import annotations
-
-import copy
+import dataclasses
 import itertools
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from ml_collections import ConfigDict
 
+from bavs_jax import active
 from bavs_jax.cameras import Cameras, reduced_cameras, take, view_pixels
 from bavs_jax.candidates import scene_hemisphere
 from bavs_jax.pixel_table import training_pixels, view_mask
@@ -23,12 +22,13 @@ from bavs_jax.selection.batch import acquire
 from bavs_jax.selection.context import make_context
 from bavs_jax.selection.policies import get_policy
 from bavs_jax.uncertainty.channel import mean_uncertainty
-from bavs_jax.uncertainty.model import RECONSTRUCTION, Acquired
+from bavs_jax.uncertainty.model import FLOW, RECONSTRUCTION, VARIANCE, Acquired
 from bavs_jax.uncertainty.streaming import table_rays
-from experiments.build import Problem, initial_views, run_key, stream_key
+from experiments.build import Problem, initial_views, load_config_scene, run_key, stream_key
 from experiments.build_model import RENDER_CHUNK, train_aside
-from experiments.runtime import peak_device_memory_mb, peak_memory_mb, track
-from experiments.schema import MAX_LOG2_CELLS, MAX_WIDTH, check_options, leaves, several, whole
+from experiments.configs import base
+from experiments.runtime import peak_device_memory_mb, peak_memory_mb, scene_cache, track
+from experiments.schema import MAX_WIDTH, check_options, whole
 
 SEED = 0
 
@@ -48,28 +48,14 @@ def default_sizes() -> ConfigDict:
     sizes.batch_size = 16
     sizes.matmul = 4096  # side of the square matrices of the ceiling
     sizes.copy_mb = 256  # 10^6 bytes of the array of the other ceiling
-    sizes.growth = ConfigDict()
-    sizes.growth.repeats = 3
-    sizes.growth.train_calls = 2
-    sizes.growth.train_rays = (512, 1024, 2048, 4096)  # of one step
-    sizes.growth.render_rays = (4096, 16384, 65536, 131072)
-    sizes.growth.curvature_rays = (4096, 16384, 32768, 65536)
-    sizes.growth.grid_log2 = (5, 6, 7, 8)  # L: grids of 2^L cells per side
-    sizes.growth.grid_rays = 16384  # whose curvature each grid gets
-    sizes.growth.candidates = (25, 100, 250, 1000)
-    sizes.growth.candidate_pixels = 25
-    sizes.growth.batch_size = (1, 4, 16, 64)
     return sizes
 
 
 def check_sizes(sizes: ConfigDict) -> None:
     """Raises ConfigError for a size that cannot be used."""
-    limits = {"candidate_pixels": MAX_WIDTH, "grid_log2": MAX_LOG2_CELLS, "matmul": 1 << 16}
-    limits |= {"copy_mb": 1 << 16, "repeats": 1000, "train_calls": 1000}
-    schema = {}
-    for name, value in leaves(default_sizes()).items():
-        one = whole(1, limits.get(name.rpartition(".")[2], 1 << 24))
-        schema[name] = several(one, 1, 16) if isinstance(value, tuple) else one
+    limits = {"candidate_pixels": MAX_WIDTH, "matmul": 1 << 16, "copy_mb": 1 << 16}
+    limits |= {"repeats": 1000, "train_calls": 1000}
+    schema = {name: whole(1, limits.get(name, 1 << 24)) for name in default_sizes()}
     check_options(sizes, schema, "sizes")
 
 
@@ -96,15 +82,6 @@ class Subject:
         problem, key = self.problem, run_key(SEED)
         acquired = Acquired(None, problem.table, self.is_training, 0, label=self.scene.name)
         self.state = train_aside(self.config, problem.trainer, key, acquired, problem.kind, track)
-
-    def changed(self, **options) -> Subject:
-        """The same field under other options; `__` in a name stands for a dot."""
-        other = copy.copy(self)
-        other.config = self.config.copy_and_resolve_references()
-        values = {name.replace("__", "."): value for name, value in options.items()}
-        other.config.update_from_flattened_dict(values)
-        other.problem = Problem(other.config, self.scene, self.problem.kind)
-        return other
 
     def draw_cameras(self, num: int, width: int) -> Cameras:
         """Cameras on the hemisphere (Eq 14) with images `width` pixels wide, as photos are."""
@@ -247,81 +224,96 @@ def measure_ceilings(sizes) -> dict[str, float]:
     }
 
 
-# --- growth ----------------------------------------------------------------------------------
+# --- the same numbers on two devices ----------------------------------------------------------
+
+# Fields of each kind: options of the config, whether the scene has no bounds, and what is trained.
+FIELDS = {
+    "hash_grid": ({}, False, RECONSTRUCTION),
+    "proposals": ({"sampler_kind": "proposal"}, False, RECONSTRUCTION),
+    "unbounded": ({"hash_grid.appearance_features": 2}, True, RECONSTRUCTION),
+    "nerf_mlp": ({"field_kind": "nerf_mlp"}, False, RECONSTRUCTION),
+    "mip_mlp": ({"field_kind": "mip_mlp"}, False, RECONSTRUCTION),
+    "learned_variance": ({}, False, VARIANCE),
+    "flow": ({}, False, FLOW),
+}
+SMALL = {
+    **{"image_size": 16, "lpips_net": "", "num_initial": 6, "batch_size": 4},
+    **{"train.num_rays": 128, "train.capacity": 4096, "train.num_steps": 96},
+    **{"hash_grid.num_levels": 4, "uncertainty.log2_cells": 4, "flow_training.num_draws": 4},
+    **{"march.num_steps": 48, "march.num_slots": 16, "march.occupancy_resolution": 16},
+    **{"nerf_mlp.depth": 2, "nerf_mlp.skip": 1, "mip_mlp.depth": 2, "mip_mlp.skip": 1},
+    "train.steps_per_call": 1,
+}
+NUM_RAYS, NUM_CANDIDATES, WIDTH = 1024, 16, 8  # that are rendered and scored
+POLICIES = ("bavs", "bavs_spread")
 
 
-def measure_growth(subject: Subject, sizes) -> dict[str, dict]:
-    """Medians of the warm runs of each stage at several sizes, and how they grow."""
-    growth, train = sizes.growth, subject.config.train
-    num, batch = sizes.select_candidates, min(sizes.batch_size, *growth.candidates)
-
-    def training(rays: int):
-        capacity = rays * train.capacity // train.num_rays
-        options = {"train__num_rays": rays, "train__capacity": capacity}
-        return subject.changed(**options).training(growth.train_calls)
-
-    def on_grid(cells: int):
-        other = subject.changed(uncertainty__log2_cells=int(np.log2(cells)))
-        return other.curvature(growth.grid_rays)
-
-    cells = [2**level for level in growth.grid_log2]
-    scoring = partial(subject.scoring, width=growth.candidate_pixels)
-    among, of_batch = partial(subject.selection, batch_size=batch), partial(subject.selection, num)
-    of_size = f"Selecting a batch of {batch}"
-    on, among_all = f"Curvature of {growth.grid_rays:,} rays", f"Selecting among {num:,} candidates"
-    # What takes the time, what grows, its sizes, and how a run of one size is made.
-    series = {
-        "train_rays": ("Training step", "rays", growth.train_rays, training),
-        "render_rays": ("Rendering", "rays", growth.render_rays, subject.rendering),
-        "curvature_rays": ("Curvature", "rays", growth.curvature_rays, subject.curvature),
-        "curvature_grid": (on, "grid cells per side", cells, on_grid),
-        "score_candidates": ("Scoring", "candidates", growth.candidates, scoring),
-        "select_candidates": (of_size, "candidates", growth.candidates, among),
-        "select_batch": (among_all, "views of the batch", growth.batch_size, of_batch),
-    }
-    num_steps = {"train_rays": growth.train_calls * train.steps_per_call}  # of a run
-    rows = {}
-    with track(sum(len(row[2]) for row in series.values()), "growth", "sizes") as bar:
-        for name, (title, size, ns, make_run) in series.items():
-            medians, memory = [], []
-            for n in ns:
-                _, seconds, _ = timed_runs(make_run(n), growth.repeats)
-                medians.append(float(np.median(seconds)) / num_steps.get(name, 1))
-                memory.append(peak_memory_mb())
-                bar.advance(1)
-            rows[name] = {
-                "title": title,
-                "size": size,
-                "sizes": list(ns),
-                "median_s": medians,
-                "peak_memory_so_far_mb": memory,
-                "fit": fit_growth(ns, medians) if len(ns) > 1 else None,
-            }
-    return rows
-
-
-def fit_growth(sizes, seconds) -> dict[str, float]:
-    """Fits `log t = log c + p log n` and `t = a + b n`, both by least squares.
-
-    The line minimises relative errors, so that small sizes count as much as large ones. An exponent
-    of 1 and a small deviation both say linear.
+def numbers_on(
+    device, config, scene: Scene, kind: str, policies: tuple[str, ...], trained=None
+) -> tuple[dict, dict]:
+    """What a device makes of a state.
 
     Args:
-      sizes: [N] n > 0, at least two different ones.
-      seconds: [N] t > 0.
+      device: one of JAX's.
+      config, scene, kind: see `Problem`.
+      policies: that choose a batch.
+      trained: the state in numpy's arrays; None: trained here.
 
     Returns:
-      `exponent` p over the measured range, a fixed cost included; `intercept_s` a, the fixed cost;
-      `slope_s` b, seconds for one more; `largest_deviation` of the points from the line, as a share
-      of the measured time.
+      the state, and by name arrays to compare; those named `views, ...` hold whole numbers.
     """
-    sizes, seconds = np.asarray(sizes, np.float64), np.asarray(seconds, np.float64)
-    exponent, _ = np.polyfit(np.log(sizes), np.log(seconds), 1)
-    slope, intercept = np.polyfit(sizes, seconds, 1, w=1.0 / seconds)
-    deviation = np.abs(intercept + slope * sizes - seconds) / seconds
-    return {
-        "exponent": float(exponent),
-        "intercept_s": float(intercept),
-        "slope_s": float(slope),
-        "largest_deviation": float(deviation.max()),
-    }
+    with jax.default_device(device):
+        subject = Subject(config, scene, config.num_initial, kind)
+        problem, table = subject.problem, subject.problem.table
+        if trained is None:
+            subject.train()
+            trained = jax.tree.map(np.asarray, subject.state)
+        subject.state = state = jax.device_put(trained, device)
+        subject.jac_sq_sum, subject.num_rays = subject.curvature(NUM_RAYS)(), NUM_RAYS
+        images, scores = subject.rendering(NUM_RAYS)(), subject.scoring(NUM_CANDIDATES, WIDTH)()
+        found = {"colours": images["rgb"], "depths": images["depth"], "scores": scores}
+        found["curvature"] = subject.jac_sq_sum
+        key, init_key = run_key(SEED), stream_key(SEED, "init")
+        whole = active.init(state, table, subject.initial)
+        for name in policies:
+            acquisition = problem.acquisition(name, subject.initial, "check")
+            choice = active.select(active.round_keys(key, 1)[0], whole, acquisition)
+            found[f"views, {name}"] = choice.candidates.view_ids[choice.selected]
+        # Adam's first mean is a share of the gradient. Last, since the state is given away.
+        state = state.replace(opt_state=problem.trainer.init(init_key).opt_state)
+        state, info = problem.trainer.call(key, state, table, subject.is_training)
+        moments = jax.tree.leaves(optax.tree_utils.tree_get(state.opt_state, "mu"))
+        found["loss"] = info.loss
+        found["gradient"] = np.concatenate([np.ravel(moment) for moment in moments])
+        return trained, {name: np.asarray(value) for name, value in found.items()}
+
+
+def difference(value: np.ndarray, wanted: np.ndarray) -> float:
+    """`|value - wanted| / |wanted|`, Euclidean; for whole numbers the share that differs."""
+    if np.issubdtype(wanted.dtype, np.integer):
+        return float(np.mean(value != wanted))
+    value, wanted = value.astype(np.float64), wanted.astype(np.float64)
+    return float(np.linalg.norm(value - wanted) / np.linalg.norm(wanted))
+
+
+def check_field(name: str, device, reference) -> dict[str, float]:
+    """Differences between two devices, by what is compared; `name` is one of `FIELDS`."""
+    options, unbounded, kind = FIELDS[name]
+    config = base.get_config()
+    config.update_from_flattened_dict({**SMALL, **options})
+    scene = load_config_scene(config, cache_dir=scene_cache())
+    scene = dataclasses.replace(scene, unbounded=unbounded)
+    policies = () if options or kind != RECONSTRUCTION else POLICIES
+    trained, wanted = numbers_on(reference, config, scene, kind, policies)
+    _, numbers = numbers_on(device, config, scene, kind, policies, trained)
+    return {key: difference(numbers[key], wanted[key]) for key in wanted}
+
+
+def too_large(differences: dict[str, dict[str, float]], tolerance: float) -> list[str]:
+    """`field: what` of all that is above the tolerance; of views, none may differ."""
+    return [
+        f"{name}: {what}"
+        for name, row in differences.items()
+        for what, value in row.items()
+        if not value <= (0.0 if what.startswith("views") else tolerance)
+    ]

@@ -5,8 +5,6 @@ None where there is no place for it now; `ended(handles)` gives those that have 
 exit status (-n: killed by signal n; None: the machine is gone); `stop(handles)` ends them.
 """
 
-from __future__ import annotations
-
 import collections
 import contextlib
 import dataclasses

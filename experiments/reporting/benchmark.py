@@ -1,18 +1,24 @@
 """The result files of the benchmark and of time to quality, as tables and pages."""
 
-from __future__ import annotations
-
 import pathlib
 
-import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, NullFormatter, NullLocator
+from matplotlib.ticker import EngFormatter
 
+from experiments.files import write_json
 from experiments.reporting import plots
-from experiments.reporting.page import Section, write_page
 from experiments.reporting.results import read_result
-from experiments.reporting.tables import Cell, Collected, Table, dash, seconds
+from experiments.reporting.tables import (
+    Cell,
+    Collected,
+    Section,
+    Table,
+    collected_text,
+    dash,
+    seconds,
+    write_page,
+)
 
 BENCHMARK, QUALITY = "benchmark.json", "time_to_quality.json"
 STAGES = {
@@ -23,7 +29,6 @@ STAGES = {
     "select": "selecting a batch",
 }
 NEAR = 0.3  # dB below the plateau, from where on a field counts as done
-PANELS = 3  # of the plot of growth, side by side
 
 
 def amount(value: float, unit: str) -> str:
@@ -63,27 +68,9 @@ def stage_table(result: dict) -> Table:
     return Table(head, tuple(rows))
 
 
-def growth_table(result: dict) -> Table:
-    """Exponents and straight lines."""
-    rows = []
-    for row in result["growth"].values():
-        sizes, times, fit = row["sizes"], row["median_s"], row["fit"]
-        texts = [row["title"], row["size"], f"{sizes[0]:,}", f"{sizes[-1]:,}"]
-        texts.append(f"{duration(times[0])} to {duration(times[-1])}")
-        if fit is not None:
-            texts += [f"{fit['exponent']:.2f}", f"at most {fit['largest_deviation']:.0%}"]
-        fitted = [dash(f"{row['title']}: one size only")] * 2 if fit is None else []
-        rows.append((*map(Cell, texts), *fitted))
-    head = ("what", "grows with", "from", "to", "time", "exponent", "off a straight line by")
-    return Table(head, tuple(rows))
-
-
 def benchmark_tables(path: pathlib.Path) -> Collected:
     """What a benchmark found; the notes say what the tables do not hold."""
     result = read_result(path)
-    tables = {"stages": stage_table(result)}
-    if result["growth"]:
-        tables["growth"] = growth_table(result)
     flops, copied = (result["ceilings"][x] for x in ("matmul_flops_per_s", "copy_bytes_per_s"))
     memory = f"Peak memory: {result['peak_memory_mb']:,.0f} MB of the host"
     if result["peak_device_memory_mb"] is not None:
@@ -94,7 +81,8 @@ def benchmark_tables(path: pathlib.Path) -> Collected:
         f"{amount(copied, 'B/s')} in a copy.",
         f"{memory}.",
     )
-    return Collected(f"`{result['command']}` ({result['device']})", tables, notes)
+    made = f"`{result['command']}` ({result['device']})"
+    return Collected(made, {"stages": stage_table(result)}, notes)
 
 
 # --- time to quality -------------------------------------------------------------------------
@@ -148,40 +136,6 @@ def first_seconds(curve: list[dict], targets: list[str]) -> dict[str, float | No
 # --- plots and pages -------------------------------------------------------------------------
 
 
-def growth_plot(result: dict) -> Markup:
-    """Seconds against size, both on log scales, with the straight line; linear has a slope of 1."""
-    growth = result["growth"]
-    num_rows = -(-len(growth) // PANELS)
-    figure = Figure(figsize=(4.0 * PANELS, 3.4 * num_rows))
-    panels = figure.subplots(num_rows, PANELS, squeeze=False).flat
-    for row, axes in zip(growth.values(), panels):
-        sizes, times, fit = np.array(row["sizes"]), np.array(row["median_s"]), row["fit"]
-        title = row["title"]
-        if fit is not None:
-            steps = np.geomspace(sizes[0], sizes[-1], 100)
-            line = fit["intercept_s"] + fit["slope_s"] * steps
-            label = f"straight line, off by at most {fit['largest_deviation']:.0%}"
-            axes.plot(steps[line > 0], line[line > 0], "--", color=plots.GREY, label=label)
-            proportional = times[-1] * steps / sizes[-1]
-            axes.plot(steps, proportional, color=plots.PALE, linewidth=1.0, label="in proportion")
-            title += f"\ntime ~ n^{fit['exponent']:.2f}"
-        axes.plot(sizes, times, "o", color=plots.BLUE, label="measured", **plots.DOT)
-        axes.set(xscale="log", yscale="log")
-        # Room above and below, so that a time which does not grow looks like one.
-        axes.set_ylim(min(times.min() / 2, times.max() / 8), times.max() * 2)
-        axes.set_xticks(sizes, [f"{size:,}" for size in sizes], rotation=30, ha="right")
-        axes.xaxis.set_minor_locator(NullLocator())
-        axes.yaxis.set_minor_formatter(NullFormatter())
-        axes.yaxis.set_major_formatter(EngFormatter("s"))
-        axes.set_xlabel(f"n: {row['size']}")
-        axes.set_title(title)
-        plots.tidy(axes)
-        axes.legend(fontsize=8)
-    for axes in panels:  # that are left
-        axes.set_axis_off()
-    return plots.to_svg(figure, salt="growth", label="How the time of each stage grows")
-
-
 def quality_plot(result: dict) -> Markup:
     """PSNR on test views against seconds since the process was started."""
     runs = result["runs"]
@@ -195,26 +149,26 @@ def quality_plot(result: dict) -> Markup:
     axes.set_xlim(0.0, None)
     axes.set_xlabel("seconds since the start, without measuring")
     axes.set_title("PSNR on test views (dB)")
-    plots.tidy(axes)
     axes.legend()
     return plots.to_svg(figure, salt="quality", label="PSNR against seconds")
 
 
+FILES = {BENCHMARK: benchmark_tables, QUALITY: quality_tables}
 STOOD = "From the start of the process; the clock stands while test views are measured."
 SECTIONS = {  # of a page: the title of a table, what is said below it, and its plot
     "stages": ("Each stage", "Rates are medians over uniformly drawn training pixels.", None),
-    "growth": ("Growth", "Medians of warm runs; an exponent of 1 is linear growth.", growth_plot),
     "time_to_quality": ("Seconds to quality", STOOD, quality_plot),
 }
 
 
-def write_result_page(path: pathlib.Path, found: Collected, title: str) -> pathlib.Path:
-    """A page beside a result file; its tables are `found`."""
-    result, sections = read_result(path), []
+def write_result(path: pathlib.Path, result: dict, title: str) -> None:
+    """Writes a result file of `FILES` and a page beside it, and prints its tables."""
+    write_json(path, result)
+    found, sections = FILES[path.name](path), []
     for name, table in found.tables.items():
         heading, note, plot = SECTIONS[name]
         sections.append(Section(heading, table, note, [plot(result)] if plot else []))
     sections[0] = sections[0]._replace(note=" ".join([sections[0].note, *found.notes]))
     page, what = path.with_suffix(".html"), f"{result['scene']}, {result['num_views']} views"
     write_page(page, title=f"{title}: {what}", made=result, sections=sections)
-    return page
+    print(f"{collected_text(found)}\nnumbers: {path}\npage:    {page}")

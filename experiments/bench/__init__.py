@@ -1,1 +1,0 @@
-"""How fast everything is: the parts of `python -m experiments.benchmark`."""
