@@ -129,7 +129,8 @@ def view_gaps(
         small, *maps = render_stack(render, cameras, mask, scale=scale, chunk=chunk, names=names)
         return Lookers(small, mask, *maps)
 
-    most = int(num_pixels(reduced_cameras(targets, image_scale)).max())
+    as_views = reduced_cameras(targets, image_scale)
+    most = int(num_pixels(as_views).max())
     scale = image_scale * min(1.0, float(np.sqrt(MOST_PIXELS / most)))
     wanted = look(targets, np.ones(len(targets), bool), scale)
     view_ids, pixels = view_pixels(wanted.cameras, np.arange(len(targets)))
@@ -138,7 +139,7 @@ def view_gaps(
     shown = TargetPixels(
         points=points.reshape(len(targets), -1, 3),
         cameras=np.asarray(wanted.cameras.positions),
-        focal=np.asarray(wanted.cameras.intrinsics[:, 0]) * (image_scale / scale),
+        focal=np.asarray(as_views.intrinsics[:, 0]),
         weight=wanted.opacity_maps.reshape(len(targets), -1),
     )
     trained_on = take(acquired.table.cameras, np.flatnonzero(acquired.is_training_view))

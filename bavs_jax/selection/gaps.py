@@ -6,8 +6,9 @@ look from the opposite side, `c_0`, which tells nothing,
     e_p = 1 / (c_0 + sum_s c_ps),    e_t = mean_p e_p,    worth of a set = -mean_t log e_t.
 
 Each look helps, and the nearest most. PSNR is a mean of logarithms over views, and so is the worth:
-the mean of `e_t` itself would hang on the worst targets. On some 600 sets of 8 to 20 views of lego
-it explains nine tenths of the variance of PSNR, as no gap between cameras does (TRIES.md).
+the mean of `e_t` itself would hang on the worst targets. On the true surface it ranks sets of 12 to
+20 views of lego by PSNR with a correlation of 0.80 to 0.88, and better than any gap between cameras
+(experiments/results/POLICIES.md).
 
 No colour and no curvature is in it. Where nothing hides anything and all cameras are equally far it
 is a soft k-median of directions; else it knows what hides, what is out of the frame, and what is
