@@ -20,7 +20,7 @@ from bavs_jax.numerics import safe_divide
 from bavs_jax.uncertainty.surface import Lookers, transmittance_to
 
 LEAST = 0.2  # radians; a look from nearer by is hardly better
-BLUR = 0.7  # radians that a look with pixels twice as wide is worse by
+BLUR = 0.25  # radians that a look with pixels twice as wide is worse by
 UNSEEN = jnp.pi**-2  # the closeness of a look from the other side, which shows nothing
 
 
