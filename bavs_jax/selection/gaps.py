@@ -7,7 +7,7 @@ look from the opposite side, `c_0`, which tells nothing,
 
 Each look helps, and the nearest most. PSNR is a mean of logarithms over views, and so is the worth:
 the mean of `e_t` itself would hang on the worst targets. On the true surface it ranks sets of 12 to
-20 views of lego by PSNR with a correlation of 0.80 to 0.88, and better than any gap between cameras
+20 views of lego by PSNR with a correlation of 0.80 to 0.88, as no gap between candidates does
 (experiments/results/POLICIES.md).
 
 No colour and no curvature is in it. Where nothing hides anything and all cameras are equally far it
