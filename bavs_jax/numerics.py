@@ -38,6 +38,11 @@ def safe_divide(numerator: Array, denominator: Array) -> jax.Array:
     return jnp.where(is_zero, 0.0, numerator / jnp.where(is_zero, 1.0, denominator))
 
 
+def unit_vectors(vectors: Array) -> jax.Array:
+    """Vectors [..., D] at length 1; one of length 0 stays 0."""
+    return safe_divide(vectors, jnp.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
 def opacity_or_empty(weights: jax.Array) -> jax.Array:
     """Opacity `sum_i w_i` of rays [..., S], and 0 with gradient 0 where it is below 1e-6: [...].
 

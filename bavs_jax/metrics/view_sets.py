@@ -9,7 +9,7 @@ from scipy.stats import spearmanr
 
 from bavs_jax.cameras import pixel_rays, project, view_pixels
 from bavs_jax.scenes.base import Scene
-from bavs_jax.uncertainty.gaps import BLUR, LEAST, UNSEEN
+from bavs_jax.uncertainty.gaps import UNSEEN, gap_of
 
 NUM_POINTS = 5000  # of the surface, that a set is described by
 BUFFER_POINTS = 200_000  # of the surface, that decide which of those hide behind others
@@ -130,9 +130,8 @@ def describe(scene: Scene, views: np.ndarray, surface: Surface | None) -> dict[s
     ratio = np.log2(surface.distance[is_seen] / closest[is_seen])
     found["resolution"] = float(np.mean(ratio)) if is_seen.any() else 0.0
     width = distance / np.asarray(scene.cameras.intrinsics)[views, :1]
-    octaves = np.log2(np.maximum(width / surface.width, 1.0))
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    closeness = np.where(seen, 1.0 / (angle**2 + LEAST**2 + (BLUR * octaves) ** 2), 0.0)
+    closeness = np.where(seen, 1.0 / gap_of(angle, width / surface.width), 0.0)
     errors = 1.0 / (UNSEEN + closeness.sum(axis=0))
     _, view, counts = np.unique(surface.view, return_inverse=True, return_counts=True)
     found["gaps"] = float(np.mean(np.log(np.bincount(view, errors) / counts)))

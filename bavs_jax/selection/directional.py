@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from bavs_jax.arrays import Array, Indices
-from bavs_jax.numerics import safe_divide
+from bavs_jax.numerics import unit_vectors
 from bavs_jax.selection.information import DEFAULT_MAX_BYTES, log_det_gain
 
 SHARPNESS = 8.0  # the kernel falls to one half at an angle of 33 degrees
@@ -51,8 +51,7 @@ class DirectionalInformation(NamedTuple):
 
 def directions_to(points, position) -> jax.Array:
     """Unit vectors [n, 3] from points [n, 3] to a position [3]; 0 for a point that lies there."""
-    away = position - points
-    return safe_divide(away, jnp.linalg.norm(away, axis=-1, keepdims=True))
+    return unit_vectors(position - points)
 
 
 def direction_kernel(cosine, *, sharpness) -> jax.Array:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from bavs_jax.arrays import Array
-from bavs_jax.numerics import safe_divide
+from bavs_jax.numerics import safe_divide, unit_vectors
 from bavs_jax.uncertainty.surface import Lookers, transmittance_to
 
 LEAST = 0.2  # radians; a look from nearer by is hardly better
@@ -33,6 +33,11 @@ class TargetPixels(NamedTuple):
     weight: Array  # [T, n] opacity in [0, 1]; 0 for a pixel that shows no surface
 
 
+def gap_of(angle, coarser) -> jax.Array:
+    """`theta^2 + LEAST^2 + (BLUR log2(max(b_s / b_t, 1)))^2` of theta and b_s / b_t, radians^2."""
+    return jnp.square(angle) + LEAST**2 + jnp.square(BLUR * jnp.log2(jnp.maximum(coarser, 1.0)))
+
+
 def squared_gap(pixels: TargetPixels, position, focal=None) -> jax.Array:
     """`theta^2 + LEAST^2 + blur^2` of a camera at `position` [3], were nothing hidden; [T, n].
 
@@ -45,13 +50,12 @@ def squared_gap(pixels: TargetPixels, position, focal=None) -> jax.Array:
     """
     wanted, looked = pixels.points - pixels.cameras[:, None], pixels.points - position
     chord = jnp.linalg.norm(unit_vectors(wanted) - unit_vectors(looked), axis=-1)
-    squared = jnp.square(2.0 * jnp.arcsin(jnp.clip(chord / 2.0, 0.0, 1.0))) + LEAST**2
+    angle = 2.0 * jnp.arcsin(jnp.clip(chord / 2.0, 0.0, 1.0))
     if focal is None:
-        return squared
+        return gap_of(angle, 1.0)
     width = jnp.linalg.norm(looked, axis=-1) / focal
     wanted_width = jnp.linalg.norm(wanted, axis=-1) / pixels.focal[:, None]
-    coarser = jnp.maximum(safe_divide(width, wanted_width), 1.0)
-    return squared + jnp.square(BLUR * jnp.log2(coarser))
+    return gap_of(angle, safe_divide(width, wanted_width))
 
 
 @jax.jit
@@ -80,8 +84,3 @@ def target_shares(pixels: TargetPixels) -> jax.Array:
     total = pixels.weight.sum(-1)
     likeness = LEAST**2 * safe_divide((closeness * pixels.weight).sum(-1), total)  # [s, t]
     return safe_divide(jnp.where(total > 0.0, 1.0, 0.0), likeness.sum(0))
-
-
-def unit_vectors(vectors) -> jax.Array:
-    """Vectors [..., 3] at length 1; one of length 0 stays."""
-    return safe_divide(vectors, jnp.linalg.norm(vectors, axis=-1, keepdims=True))

@@ -9,7 +9,7 @@ from PIL import Image
 
 from bavs_jax.arrays import Array
 from bavs_jax.cameras import Cameras, project, reduced_cameras, take
-from bavs_jax.numerics import opacity_or_empty, safe_divide, x_log_x
+from bavs_jax.numerics import opacity_or_empty, safe_divide, unit_vectors, x_log_x
 from bavs_jax.rendering.images import RenderChunk, render_views
 from bavs_jax.scenes.base import Scene
 from bavs_jax.training.train import TrainState
@@ -200,8 +200,7 @@ def direction_novelty(
 
 def directions_from(camera: Cameras, points: Array) -> jax.Array:
     """Unit directions [..., 3] from one camera to points [..., 3]; 0 for a point on it."""
-    towards = points - camera.positions
-    return safe_divide(towards, jnp.linalg.norm(towards, axis=-1, keepdims=True))
+    return unit_vectors(points - camera.positions)
 
 
 def least_over_cameras(
